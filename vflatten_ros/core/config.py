@@ -1,0 +1,224 @@
+"""Every default, once: frozen dataclasses that become ROS parameters, config/*.yaml and docs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar, get_type_hints
+
+from vflatten_ros.core.errors import InvalidConfig
+
+Section = TypeVar("Section", bound="Checked")
+METHODS = ("rotation", "kita2019")
+
+
+def option(
+    default: Any,
+    doc: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    read_only: bool = False,
+) -> Any:
+    """A configuration field with its description and allowed range.
+
+    `low` and `high` are inclusive. `read_only`: cannot change while the node is active.
+    """
+    metadata = {"doc": doc, "low": low, "high": high, "choices": choices, "read_only": read_only}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A section whose fields are checked against their type, range and choices."""
+
+    def __post_init__(self) -> None:
+        types = get_type_hints(type(self))
+        for item in dataclasses.fields(self):
+            _check(type(self).__name__, item, types[item.name], getattr(self, item.name))
+
+
+def _check(section: str, item: dataclasses.Field[Any], kind: Any, value: Any) -> None:
+    name = f"{section}.{item.name}"
+    if kind is float and type(value) not in (float, int):
+        raise InvalidConfig(f"{name}: expected a number, got {value!r}")
+    if kind in (int, bool, str) and type(value) is not kind:
+        raise InvalidConfig(f"{name}: expected {kind.__name__}, got {value!r}")
+    low, high = item.metadata.get("low"), item.metadata.get("high")
+    if low is not None and not value >= low or high is not None and not value <= high:
+        raise InvalidConfig(f"{name}: expected {low} to {high}, got {value}; {item.metadata['doc']}")
+    choices = item.metadata.get("choices", ())
+    if choices and value not in choices:
+        raise InvalidConfig(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+@dataclass(frozen=True)
+class JointConfig(Checked):
+    """Wrist angle at a cloud's stamp."""
+
+    max_age_s: float = option(
+        0.1, "Farthest a joint state may be from a cloud's stamp, s.", low=0.001, high=10.0
+    )
+    wait_s: float = option(
+        1.0, "How long a cloud waits for its joint states, s.", low=0.0, high=60.0
+    )
+    history_s: float = option(30.0, "Joint states kept, s.", low=1.0, high=3600.0)
+
+
+@dataclass(frozen=True)
+class SegmentationConfig(Checked):
+    """Which points of a cloud belong to the item."""
+
+    radius_m: float = option(
+        0.6, "Farthest an item point may be from the wrist axis, m.", low=0.05, high=5.0
+    )
+
+
+@dataclass(frozen=True)
+class BufferConfig(Checked):
+    """How many views are kept."""
+
+    max_views: int = option(128, "Most views kept at a time.", low=2, high=10000)
+    max_megabytes: float = option(512.0, "Most memory for views, MB.", low=1.0, high=65536.0)
+    duplicate_angle_deg: float = option(
+        2.0, "Views nearer in angle replace one another, the better stays, deg.", low=0.0, high=45.0
+    )
+
+
+@dataclass(frozen=True)
+class SurfaceConfig(Checked):
+    """Local fit of the cloth's surface."""
+
+    fit: str = option(
+        "quadratic",
+        "Local fit: 'linear' in (x, y) as the paper's, or 'quadratic' in the local tangent frame.",
+        choices=("quadratic", "linear"),
+    )
+    radius_m: float = option(0.0125, "Radius r0 of the local fit, m.", low=0.002, high=0.1)
+
+
+@dataclass(frozen=True)
+class BoundaryConfig(Checked):
+    """Points on the boundary of the observed region (paper, section 3)."""
+
+    spacing_m: float = option(0.02, "Distance between boundary points, m.", low=0.002, high=0.2)
+
+
+@dataclass(frozen=True)
+class GeodesicConfig(Checked):
+    """Shortest lines along the surface (paper, section 2.1)."""
+
+    nodes: int = option(30, "Nodes M of a line.", low=3, high=500)
+    height_window_m: float = option(
+        0.05, "Pairs of boundary points nearer in height than this get a line, m.", low=0.0, high=2.0
+    )
+
+
+@dataclass(frozen=True)
+class FlatteningConfig(Checked):
+    """Distances to plane (paper, section 2.2)."""
+
+    solver: str = option(
+        "majorization",
+        "'springs' as the paper's, or 'majorization': weighted robust stress majorisation.",
+        choices=("majorization", "springs"),
+    )
+
+
+@dataclass(frozen=True)
+class ContourConfig(Checked):
+    """Flattened points to outline."""
+
+
+@dataclass(frozen=True)
+class RecognitionConfig(Checked):
+    """Outline to category (paper, eq. 11)."""
+
+
+@dataclass(frozen=True)
+class MeasurementConfig(Checked):
+    """Category and outline to sizes and landmarks."""
+
+
+@dataclass(frozen=True)
+class RotationConfig(Checked):
+    """The automatic method: one surface model from all views."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of the method."""
+
+    method: str = "rotation"
+    joints: JointConfig = JointConfig()
+    segmentation: SegmentationConfig = SegmentationConfig()
+    buffer: BufferConfig = BufferConfig()
+    surface: SurfaceConfig = SurfaceConfig()
+    boundary: BoundaryConfig = BoundaryConfig()
+    geodesics: GeodesicConfig = GeodesicConfig()
+    flattening: FlatteningConfig = FlatteningConfig()
+    contour: ContourConfig = ContourConfig()
+    recognition: RecognitionConfig = RecognitionConfig()
+    measurement: MeasurementConfig = MeasurementConfig()
+    rotation: RotationConfig = RotationConfig()
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InvalidConfig(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+
+
+def sections() -> Iterator[tuple[str, type[Checked]]]:
+    """Name and class of every section, in the order of Config."""
+    types = get_type_hints(Config)
+    for item in dataclasses.fields(Config):
+        kind = types[item.name]
+        if isinstance(kind, type) and issubclass(kind, Checked):
+            yield item.name, kind
+
+
+def flatten_config(config: Config) -> dict[str, Any]:
+    """Every setting as 'section.name' -> value."""
+    flat: dict[str, Any] = {"method": config.method}
+    for name, _ in sections():
+        for item in dataclasses.fields(getattr(config, name)):
+            flat[f"{name}.{item.name}"] = getattr(getattr(config, name), item.name)
+    return flat
+
+
+def config_from(values: Mapping[str, Any], base: Config | None = None) -> Config:
+    """A configuration from 'section.name' -> value (or nested mappings), other values from `base`.
+
+    Raises
+    ------
+    InvalidConfig
+        An unknown name, a wrong type or a value outside its range.
+    """
+    base = base or Config()
+    known = flatten_config(base)
+    given = dict(_walk(values))
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        raise InvalidConfig(f"unknown setting {unknown[0]!r}; known are: {', '.join(known)}")
+    changed: dict[str, Any] = {}
+    if "method" in given:
+        changed["method"] = given["method"]
+    for name, kind in sections():
+        own = {f.name: given[f"{name}.{f.name}"] for f in dataclasses.fields(kind) if f"{name}.{f.name}" in given}
+        if own:
+            changed[name] = dataclasses.replace(getattr(base, name), **_as_floats(kind, own))
+    return dataclasses.replace(base, **changed)
+
+
+def _walk(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _walk(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _as_floats(kind: type[Checked], values: dict[str, Any]) -> dict[str, Any]:
+    types = get_type_hints(kind)
+    return {k: float(v) if types[k] is float and type(v) is int else v for k, v in values.items()}

@@ -1,0 +1,64 @@
+"""Rigid transforms and the frames of the rig.
+
+Frames (right-handed, metres):
+
+rig
+    The optical frame of the point clouds: x right, y down, z forward (REP-103 optical).
+hanger
+    The item's own frame. Origin at the gripper tip, z up along the wrist axis; at item angle 0
+    its x axis points horizontally from the axis towards the rig, so y points to the right as the
+    rig sees it. It turns with the wrist: what hangs still on the item has constant coordinates.
+view
+    The paper's frame of one observation: x right, y up along the axis, z towards the rig, origin
+    at the gripper tip. It stands still: view (x, y, z) = hanger (y, z, x) at item angle 0.
+flat
+    The table plane (u, v).
+
+`T_a_b` is the (4, 4) matrix that takes coordinates in b to coordinates in a.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+# rows: view x, y, z in hanger coordinates at item angle 0
+R_VIEW_HANGER0: Float = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+
+
+def rotation_about(axis: Float, angle_rad: float) -> Float:
+    """(3, 3) right-handed rotation about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation: Float = (
+        np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * cross @ cross
+    )
+    return rotation
+
+
+def rigid(rotation: Float, translation: Float) -> Float:
+    """(4, 4) transform from a (3, 3) rotation and a translation of 3."""
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = translation
+    return transform
+
+
+def inverse(transform: Float) -> Float:
+    """T_b_a from T_a_b."""
+    rotation = transform[:3, :3].T
+    return rigid(rotation, -rotation @ transform[:3, 3])
+
+
+def transform_points(transform: Float, points: Float) -> Float:
+    """Apply a (4, 4) transform to (..., 3) points."""
+    moved: Float = points @ transform[:3, :3].T + transform[:3, 3]
+    return moved
+
+
+def transform_directions(transform: Float, directions: Float) -> Float:
+    """Rotate (..., 3) directions by a (4, 4) transform."""
+    turned: Float = directions @ transform[:3, :3].T
+    return turned

@@ -1,0 +1,228 @@
+"""The values that pass between the stages. All are frozen; arrays are never edited in place.
+
+Frames are defined in vflatten_ros.core.geometry. Metres, radians, nanoseconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vflatten_ros.core.geometry import (
+    R_VIEW_HANGER0,
+    inverse,
+    rigid,
+    rotation_about,
+    transform_points,
+)
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+Byte = NDArray[np.uint8]
+
+Progress = Callable[[str, float], None]
+"""Called as progress(stage, fraction) at least every 50 ms of work; may raise Cancelled."""
+
+
+def no_progress(stage: str, fraction: float) -> None:
+    """A progress callback that does nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """One decoded point cloud."""
+
+    stamp_ns: int
+    frame_id: str
+    xyz: NDArray[np.float32]  # (rows, cols, 3), rig frame, NaN where unmeasured; rows = 1: unorganised
+    rgb: Byte | None  # (rows, cols, 3), 0-255; None: the cloud has no colour
+
+    @property
+    def organised(self) -> bool:
+        """Whether neighbours in the array are neighbours in the image."""
+        return self.xyz.shape[0] > 1
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where the wrist axis is and how the joint turns the item."""
+
+    frame: str  # frame_id of the clouds
+    axis_point: tuple[float, float, float]  # a point of the wrist axis, rig frame
+    axis_direction: tuple[float, float, float]  # unit, upwards, rig frame
+    gripper_tip: tuple[float, float, float]  # where the item is held, rig frame
+    joint: str  # name of the wrist joint in JointState
+    joint_sign: float  # +1 or -1
+    joint_zero_rad: float
+
+    def item_angle_rad(self, joint_rad: float) -> float:
+        """Item angle about axis_direction, right-handed, at a joint position."""
+        return self.joint_sign * (joint_rad - self.joint_zero_rad)
+
+    def T_rig_hanger(self, angle_rad: float) -> Float:
+        """Hanger frame (at this item angle) to rig frame."""
+        up = np.array(self.axis_direction)
+        to_rig = -np.array(self.axis_point)
+        toward = to_rig - (to_rig @ up) * up
+        toward /= np.linalg.norm(toward)
+        at_zero = np.stack([toward, np.cross(up, toward), up], axis=1)  # columns: hanger x, y, z
+        turn = rotation_about(up, angle_rad)
+        point = np.array(self.axis_point)
+        tip = point + turn @ (np.array(self.gripper_tip) - point)
+        return rigid(turn @ at_zero, tip)
+
+    @property
+    def T_view_rig(self) -> Float:
+        """Rig frame to the standing view frame of the paper."""
+        T_hanger0_rig = inverse(self.T_rig_hanger(0.0))
+        return rigid(R_VIEW_HANGER0, np.zeros(3)) @ T_hanger0_rig
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The item's points in one cloud, and the wrist angle at its stamp."""
+
+    view_id: int  # index of the cloud in order of arrival, dropped clouds counted
+    stamp_ns: int
+    angle_rad: float  # item angle at the stamp, turns unwrapped
+    points_rig: Float  # (n, 3), rig frame
+    pixel: NDArray[np.int32]  # (n, 2) row, col in the cloud; row 0 where unorganised
+    rgb: Byte | None  # (n, 3)
+    shape: tuple[int, int]  # rows, cols of the cloud
+    calibration: Calibration
+
+    @property
+    def points_hanger(self) -> Float:
+        """(n, 3) points in the item's own frame, by the wrist angle alone."""
+        return transform_points(inverse(self.calibration.T_rig_hanger(self.angle_rad)), self.points_rig)
+
+    @property
+    def points_view(self) -> Float:
+        """(n, 3) points in the paper's frame: x right, y up, z towards the rig."""
+        return transform_points(self.calibration.T_view_rig, self.points_rig)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held by the arrays, bytes."""
+        colour = 0 if self.rgb is None else self.rgb.nbytes
+        return self.points_rig.nbytes + self.pixel.nbytes + colour
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """One point of the cloth seen in two views."""
+
+    view_a: int  # view_id
+    view_b: int
+    pixel_a: tuple[int, int]  # row, col
+    pixel_b: tuple[int, int]
+    manual: bool = True
+    confidence: float = 1.0  # 0-1
+
+
+@dataclass(frozen=True, eq=False)
+class FlatPoints:
+    """Points of the cloth: where they hang and where they lie when the item is flat."""
+
+    uv: Float  # (n, 2), flat frame
+    xyz_hanger: Float  # (n, 3), hanger frame
+    view_id: Int  # (n,), -1: in no view
+    pixel: Int  # (n, 2) row, col in that view; -1 in no view
+    sigma_m: Float  # (n,) one standard deviation of uv per axis
+    stress: Float  # (n,) rms misfit of the distances at the point, metres
+    inferred: Bool  # (n,) True: placed by the category's template, not seen
+
+
+@dataclass(frozen=True, eq=False)
+class GeodesicLines:
+    """Shortest paths along the cloth, for figures and markers."""
+
+    nodes_hanger: Float  # (lines, nodes, 3)
+    view_id: Int  # (lines,)
+    length_m: Float  # (lines,)
+    sigma_m: Float  # (lines,)
+    flagged: Bool  # (lines,) True: crosses a jump or missing data
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Closed outline of the flattened item, counter-clockwise, last point not repeated."""
+
+    uv: Float  # (k, 2), flat frame
+    sigma_m: Float  # (k,)
+    inferred: Bool  # (k,) True: no view shows this part
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One named size of the item laid flat."""
+
+    name: str  # "width", "length", or one of the category's own
+    value_m: float
+    sigma_m: float
+    inferred: bool  # True: rests on parts that no view shows
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """One named point of the item."""
+
+    name: str
+    uv: tuple[float, float]  # flat frame
+    uv_sigma_m: float
+    xyz_hanger: tuple[float, float, float] | None  # None: unseen
+    xyz_sigma_m: float
+    views: tuple[int, ...]  # view_ids that show it, best first
+    certainty: float  # 0-1
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something that the user of a result should know."""
+
+    code: str  # one of NOTICE_CODES in this module
+    text: str
+
+
+NOTICE_CODES: Mapping[str, str] = {
+    "length_unseen": "a size rests on a part of the item that no view shows",
+    "width_unseen": "a width rests on a part of the item that no view shows",
+    "low_coverage": "much of the item was not seen",
+    "hidden_crease": "a deep crease probably hides cloth",
+    "category_uncertain": "two categories fit nearly as well",
+    "correspondence_rejected": "a corresponding point contradicts the others",
+    "high_stress": "the distances contradict each other more than noise explains",
+    "truncated": "the item reaches the border of the image",
+    "untrusted": "the result should not be used for sizes",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FlatGarment:
+    """What the item would look like laid flat, and how sure that is."""
+
+    method: str
+    view_ids: tuple[int, ...]
+    stamp_ns: int  # newest view
+    points: FlatPoints
+    start_uv: Float | None  # (n, 2) where the flattening started, rows as points; None: no single start
+    lines: GeodesicLines
+    outline: Outline
+    category: str  # best category or "unknown"
+    scores: Mapping[str, float]  # category -> score of the method (R of eq. 11, or probability)
+    score_kind: str  # "R" or "probability"
+    template_uv: Float  # (k, 2) the best category's outline fitted to the item; (0, 2) if unknown
+    measurements: tuple[Measurement, ...]
+    landmarks: tuple[Landmark, ...]
+    correspondences: tuple[Correspondence, ...]
+    coverage: float  # 0-1, share of the template's area that was seen
+    quality: float  # 0-1, higher is better
+    notices: tuple[Notice, ...] = field(default=())
+
+    def measurement(self, name: str) -> Measurement | None:
+        """The measurement of that name, None if it was not made."""
+        return next((m for m in self.measurements if m.name == name), None)

@@ -165,6 +165,7 @@ class Measurement:
     value_m: float
     sigma_m: float
     inferred: bool  # True: rests on parts that no view shows
+    ends_uv: tuple[tuple[float, float], tuple[float, float]] | None = None  # flat frame, for drawing
 
 
 @dataclass(frozen=True)

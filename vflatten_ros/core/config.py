@@ -134,7 +134,22 @@ class ContourConfig(Checked):
 
 @dataclass(frozen=True)
 class RecognitionConfig(Checked):
-    """Outline to category (paper, eq. 11)."""
+    """Outline to category (paper, eq. 11; fit of the categories' outlines)."""
+
+    decay: float = option(
+        0.05, "Decay of eq. 11's model images, in longest lengths.", low=0.005, high=0.5
+    )
+    model_rotations: int = option(180, "Rotations tried by eq. 11.", low=8, high=3600)
+    fit_rotations: int = option(24, "Rotations from which the outlines are fitted.", low=4, high=360)
+    misfit_m: float = option(
+        0.008, "How far cuts differ from the categories' outlines, one sigma, m.", low=0.001, high=0.1
+    )
+    correlation_m: float = option(
+        0.08, "Length of outline over which errors are alike, m.", low=0.005, high=1.0
+    )
+    unknown_misfit: float = option(
+        1.0, "Misfit, in sigma squared halves, at which 'unknown' wins.", low=0.1, high=20.0
+    )
 
 
 @dataclass(frozen=True)
@@ -145,6 +160,31 @@ class MeasurementConfig(Checked):
 @dataclass(frozen=True)
 class RotationConfig(Checked):
     """The automatic method: one surface model from all views."""
+
+    noise_m: float = option(0.001, "Depth noise of one point, m.", low=1e-5, high=0.02)
+    view_fit_m: float = option(
+        0.012, "Radius of the local planes of a single view, m.", low=0.002, high=0.1
+    )
+    sway_m: float = option(0.003, "How far the item sways, m.", low=1e-5, high=0.1)
+    lag_deg: float = option(0.5, "How far the item lags behind the wrist, deg.", low=0.001, high=20)
+    axis_m: float = option(0.003, "Error of the calibrated axis' place, m.", low=1e-5, high=0.1)
+    axis_deg: float = option(
+        0.5, "Error of the calibrated axis' direction, deg.", low=0.001, high=20.0
+    )
+    overlap_deg: float = option(
+        50.0, "Views nearer in angle are registered to one another, deg.", low=1.0, high=180.0
+    )
+    register_points: int = option(
+        500, "Points of a view that are registered.", low=50, high=100000
+    )
+    register_reach_m: float = option(
+        0.008, "Points farther apart are not the same cloth, m.", low=0.001, high=0.1
+    )
+    register_rounds: int = option(6, "Most rounds of the registration.", low=1, high=100)
+    spacing_m: float = option(0.004, "Spacing of the surface samples, m.", low=0.001, high=0.05)
+    fit_m: float = option(
+        0.007, "Radius of the local fit of a sample to all views, m.", low=0.002, high=0.05
+    )
 
 
 @dataclass(frozen=True)

@@ -74,6 +74,35 @@ class SegmentationConfig(Checked):
     radius_m: float = option(
         0.6, "Farthest an item point may be from the wrist axis, m.", low=0.05, high=5.0
     )
+    length_m: float = option(
+        2.5, "Farthest an item point may hang below the gripper tip, m.", low=0.1, high=10.0
+    )
+    tip_clearance_m: float = option(
+        0.008, "Points less than this below the gripper tip are the gripper's, m.", low=-0.1, high=0.5
+    )
+    hold_m: float = option(
+        0.15, "The item begins within this distance of the gripper tip, m.", low=0.01, high=1.0
+    )
+    link_m: float = option(0.015, "Points nearer than this are one piece, m.", low=0.003, high=0.1)
+    gap_m: float = option(
+        0.15, "A piece belongs to the item if no wider gap parts them, m.", low=0.0, high=1.0
+    )
+    piece_area_m2: float = option(
+        0.0001, "Pieces that show less than this area are noise, m2.", low=0.0, high=0.1
+    )
+    support_m: float = option(
+        0.01, "Neighbours within this depth support a point, m.", low=0.001, high=0.1
+    )
+    support_points: int = option(
+        3, "A point with fewer neighbours at its depth is a flying pixel.", low=0, high=12
+    )
+    wall_m: float = option(
+        0.015, "Half the thickness taken for a wall or table, m.", low=0.001, high=0.1
+    )
+    wall_area_m2: float = option(
+        0.05, "Planes that show less area outside of the radius are no walls, m2.", low=0.001, high=10.0
+    )
+    min_points: int = option(100, "Views with fewer item points are dropped.", low=3, high=100000)
 
 
 @dataclass(frozen=True)
@@ -156,6 +185,19 @@ class RecognitionConfig(Checked):
 class MeasurementConfig(Checked):
     """Category and outline to sizes and landmarks."""
 
+    landmark_radius_m: float = option(
+        0.02, "Farthest seen point from a landmark whose place in 3-D it gives, m.", low=0.002, high=0.2
+    )
+    layer_gap_m: float = option(
+        0.02, "Points of one flat place farther apart in 3-D lie on two layers, m.", low=0.002, high=0.5
+    )
+    low_coverage: float = option(
+        0.75, "Share of the item seen below which the result says so.", low=0.0, high=1.0
+    )
+    trusted_quality: float = option(
+        0.3, "Quality below which sizes are not to be trusted.", low=0.0, high=1.0
+    )
+
 
 @dataclass(frozen=True)
 class RotationConfig(Checked):
@@ -185,6 +227,14 @@ class RotationConfig(Checked):
     fit_m: float = option(
         0.007, "Radius of the local fit of a sample to all views, m.", low=0.002, high=0.05
     )
+    link_m: float = option(0.0088, "Longest link between samples, m.", low=0.002, high=0.1)
+    step_m: float = option(
+        0.0008, "Largest step between linked samples, along their normal, m.", low=1e-5, high=0.02
+    )
+    overlap: float = option(
+        0.3, "Least share of neighbours that linked samples have in common.", low=0.0, high=1.0
+    )
+    rim_m: float = option(0.007, "Longest link round a sharp rim, m.", low=0.001, high=0.05)
 
 
 @dataclass(frozen=True)

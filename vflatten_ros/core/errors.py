@@ -21,6 +21,10 @@ class InvalidCloud(VFlattenError):
     """A point cloud message whose layout contradicts itself."""
 
 
+class EmptyView(VFlattenError):
+    """A cloud in which no item is seen below the gripper."""
+
+
 class InvalidRecording(VFlattenError):
     """A recording that cannot be read, or lacks what the method needs."""
 

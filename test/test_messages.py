@@ -1,0 +1,235 @@
+"""Core values <-> message fields, and message fields <-> message objects."""
+
+import array
+import json
+import re
+import types
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from garments import example_garment, example_views
+
+from vflatten_ros import displays, messages
+from vflatten_ros.core.errors import InvalidCorrespondence
+from vflatten_ros.core.geometry import transform_points
+
+VIEWS = example_views()
+GARMENT = example_garment(VIEWS)
+BY_ID = {view.view_id: view for view in VIEWS}
+MSG = Path(__file__).parent.parent / "msg"
+
+
+def names_in(message: str) -> list[str]:
+    """Field names of one of our messages, in order."""
+    lines = (MSG / f"{message}.msg").read_text().splitlines()
+    fields = [re.match(r"(\S+)\s+([a-z]\w*)\s*(#.*)?$", line) for line in lines]
+    return [field[2] for field in fields if field]
+
+
+@pytest.mark.parametrize(
+    ("message", "fields"),
+    [
+        ("FlattenedView", messages.flattened_view_fields(GARMENT, VIEWS)),
+        ("GarmentEstimate", messages.garment_estimate_fields(GARMENT, VIEWS)),
+        ("ViewInfo", messages.view_info_fields(VIEWS[0], True)),
+        ("Measurement", messages.measurement_fields(GARMENT.measurements[0])),
+        ("Landmark", messages.landmark_fields(GARMENT.landmarks[0])),
+        ("Correspondence", messages.correspondence_fields(GARMENT.correspondences[0], 1, BY_ID)),
+    ],
+)
+def test_every_field_of_the_message_is_given(message, fields):
+    assert list(fields) == names_in(message)
+
+
+def test_buffer_state_counts_and_sorts():
+    fields = messages.view_buffer_state_fields(
+        VIEWS[::-1],
+        frame_id="rig_optical",
+        state=1,
+        item=3,
+        selected=[5],
+        angle_covered_rad=1.5,
+        correspondences=2,
+        clouds_received=9,
+        clouds_waiting=1,
+        drops={"no_joint_state": 4, "empty": 2},
+    )
+    assert list(fields) == names_in("ViewBufferState")
+    assert [view["id"] for view in fields["views"]] == [2, 5]
+    assert [view["selected"] for view in fields["views"]] == [False, True]
+    assert fields["drop_reasons"] == ["empty", "no_joint_state"]
+    assert fields["drop_counts"].tolist() == [2, 4]
+    assert messages.stamp_ns(fields["header"]["stamp"]) == VIEWS[1].stamp_ns
+
+
+def test_flattened_view_holds_the_garment_in_float32():
+    fields = messages.flattened_view_fields(GARMENT, VIEWS)
+    assert fields["header"]["frame_id"] == "rig_optical"
+    assert fields["u"].dtype == np.float32
+    assert np.array_equal(fields["u"], GARMENT.points.uv[:, 0].astype(np.float32))
+    assert fields["row"].tolist() == GARMENT.points.pixel[:, 0].tolist()
+    assert np.degrees(fields["view_angles"]) == pytest.approx([-40, 40])
+    assert len({len(fields[k]) for k in ("u", "v", "x", "view", "stress", "evidence")}) == 1
+    assert fields["stress_rms"] == pytest.approx(0.001)
+
+
+def test_estimate_ranks_hypotheses_and_puts_width_and_length_first():
+    fields = messages.garment_estimate_fields(GARMENT, VIEWS)
+    assert [h["category"] for h in fields["hypotheses"]] == ["towel", "trousers", "shorts"]
+    assert [m["name"] for m in fields["measurements"]] == ["width", "length"]
+    assert [m["evidence"] for m in fields["measurements"]] == [messages.SEEN, messages.INFERRED]
+    assert [mark["seen"] for mark in fields["landmarks"]] == [True, True, False]
+    assert fields["trusted"]
+
+
+def test_a_correspondence_survives_the_round_trip():
+    pair = GARMENT.correspondences[1]
+    fields = messages.correspondence_fields(pair, 7, BY_ID)
+    assert messages.correspondence_from_fields(fields, BY_ID) == pair
+
+
+def test_a_point_becomes_the_nearest_pixel():
+    pair = GARMENT.correspondences[1]
+    fields = messages.correspondence_fields(pair, 7, BY_ID)
+    given = {**fields, "given_a": messages.POINT, "pixel_a": [0, 0]}
+    assert messages.correspondence_from_fields(given, BY_ID) == pair
+
+
+def test_a_pixel_just_off_the_edge_moves_onto_the_item():
+    view = VIEWS[0]
+    row = int(np.median(view.pixel[:, 0]))
+    edge = int(view.pixel[view.pixel[:, 0] == row, 1].min())
+    assert messages.pixel_on_item(view, (row, edge - 2)) == (row, edge)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"view_a": 9}, "view 9 is not in the buffer; views held: 2, 5"),
+        ({"view_b": 2}, "two different views"),
+        ({"pixel_a": [2, 2]}, "not on the item"),
+        ({"pixel_b": [480, 10]}, "outside view 5"),
+        ({"given_a": 1, "point_a": {"x": 0.0, "y": 0.0, "z": 0.0}}, "nearest point is"),
+        ({"given_a": 1, "point_a": {"x": float("nan"), "y": 0.0, "z": 0.0}}, "not finite"),
+        ({"given_b": 4}, "given_b"),
+        ({"confidence": 1.5}, "confidence"),
+    ],
+)
+def test_a_wrong_correspondence_is_refused_with_its_reason(change, says):
+    fields = messages.correspondence_fields(GARMENT.correspondences[0], 1, BY_ID)
+    with pytest.raises(InvalidCorrespondence, match=re.escape(says)):
+        messages.correspondence_from_fields({**fields, **change}, BY_ID)
+
+
+def test_cloud_and_markers_cover_the_newest_view():
+    newest = VIEWS[1]
+    own = GARMENT.points.view_id == newest.view_id
+    fields = displays.points_fields(GARMENT, VIEWS)
+    rows = np.frombuffer(fields["data"].tobytes(), "<f4").reshape(fields["width"], -1)
+    T_rig_hanger = newest.calibration.T_rig_hanger(newest.angle_rad)
+    there = transform_points(T_rig_hanger, GARMENT.points.xyz_hanger)
+    assert np.abs(rows[own, :3] - there[own]).max() < 1e-6  # float32 at 1.3 m
+    live = {tuple(p) for p in newest.pixel.tolist()}
+    assert all(tuple(p) in live for p in GARMENT.points.pixel[own].tolist())
+    assert [f["name"] for f in fields["fields"]] == ["x", "y", "z", "u", "v", "sigma"]
+    assert len(fields["data"]) == fields["row_step"] == fields["width"] * fields["point_step"]
+
+
+def test_markers_show_every_part():
+    markers = displays.marker_fields(GARMENT, VIEWS)["markers"]
+    by_name = {marker["ns"]: marker for marker in markers}
+    assert markers[0]["action"] == 3  # delete what the last result drew
+    assert len(by_name["geodesic_lines"]["points"]) == 8 * 14 * 2
+    assert len(by_name["geodesic_lines"]["colors"]) == 8 * 14 * 2
+    assert len(by_name["correspondences"]["points"]) == 6
+    assert len(by_name["outline"]["points"]) == 2 * len(GARMENT.outline.uv)
+    assert len(by_name["sizes"]["points"]) == 4
+    assert len(by_name["landmarks"]["points"]) == 2
+    # the flat outline stands upright beside the item: metric, not mirrored
+    outline = np.array([[p[k] for k in "xyz"] for p in by_name["outline"]["points"]])
+    assert np.ptp(outline, axis=0) == pytest.approx([0.30, 0.50, 0.0], abs=1e-9)
+
+
+def test_markers_of_an_empty_garment_are_empty():
+    none = replace(
+        GARMENT,
+        lines=replace(
+            GARMENT.lines,
+            nodes_hanger=np.empty((0, 3, 3)),
+            view_id=np.empty(0, np.int64),
+            length_m=np.empty(0),
+            sigma_m=np.empty(0),
+            flagged=np.empty(0, bool),
+        ),
+        measurements=(),
+        landmarks=(),
+        correspondences=(),
+    )
+    by_name = {m["ns"]: m for m in displays.marker_fields(none, VIEWS)["markers"]}
+    assert by_name["geodesic_lines"]["points"] == []
+    assert by_name["sizes"]["points"] == []
+
+
+def make_class(class_name, /, **types_of):
+    """A class that looks like a generated message."""
+
+    def get_fields_and_field_types(self):
+        return types_of
+
+    return type(class_name, (), {"get_fields_and_field_types": get_fields_and_field_types})
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    point = make_class("Point", x="double", y="double")
+    module = types.SimpleNamespace(Point=point)
+    monkeypatch.setattr(messages, "import_module", {"fake_msgs.msg": module}.__getitem__)
+    return make_class(
+        "Fake",
+        name="string",
+        level="octet",
+        u="sequence<float>",
+        data="sequence<uint8>",
+        ids="sequence<uint32, 10>",
+        pixel="int32[2]",
+        names="sequence<string>",
+        at="fake_msgs/Point",
+        places="sequence<fake_msgs/Point>",
+    )
+
+
+FILLED = {
+    "name": "a",
+    "level": 2,
+    "u": np.array([0.5, 1.5], np.float32),
+    "data": np.array([1, 2, 255], np.uint8),
+    "ids": [3, 4],
+    "pixel": np.array([7, 8], np.int32),
+    "names": ["b", "c"],
+    "at": {"x": 1.0, "y": 2.0},
+    "places": [{"x": 3.0, "y": 4.0}, {"x": 5.0, "y": 6.0}],
+}
+
+
+def test_fill_gives_every_field_the_type_that_rclpy_takes_unchecked(fake):
+    message = messages.fill(fake(), FILLED)
+    assert message.u == array.array("f", [0.5, 1.5])
+    assert message.data == array.array("B", [1, 2, 255])
+    assert message.ids == array.array("I", [3, 4])
+    assert message.level == b"\x02"
+    assert message.pixel.dtype == np.int32
+    assert message.names == ["b", "c"]
+    assert (message.at.x, message.places[1].y) == (1.0, 6.0)
+
+
+def test_read_is_the_reverse_of_fill(fake):
+    fields = messages.read(messages.fill(fake(), FILLED))
+    plain = json.loads(json.dumps(fields, default=lambda a: a.tolist()))
+    assert plain == json.loads(json.dumps(FILLED, default=lambda a: a.tolist()))
+
+
+def test_fill_refuses_an_unknown_field(fake):
+    with pytest.raises(KeyError, match="colour"):
+        messages.fill(fake(), {"colour": 1})

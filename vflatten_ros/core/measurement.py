@@ -1,0 +1,216 @@
+"""Category and fitted outline to named sizes, named places, and how far to trust them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.config import MeasurementConfig
+from vflatten_ros.core.recognition import UNKNOWN, Recognition
+from vflatten_ros.core.template_fit import Fit, place
+from vflatten_ros.core.templates import Float
+from vflatten_ros.core.values import FlatPoints, Landmark, Measurement, Notice, Outline
+
+CELL_M = 0.01  # of the area counted as seen
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Sizes and places of one item."""
+
+    measurements: tuple[Measurement, ...]  # width and length first
+    landmarks: tuple[Landmark, ...]
+    coverage: float  # 0-1, share of the fitted outline's area that was seen
+    quality: float  # 0-1
+    notices: tuple[Notice, ...]
+
+
+def measure(
+    recognition: Recognition, outline: Outline, points: FlatPoints, config: MeasurementConfig
+) -> Measured:
+    """Sizes and landmarks of the recognised category on the flattened item.
+
+    Parameters
+    ----------
+    recognition : Recognition
+        Of the same outline and points.
+    outline : Outline
+    points : FlatPoints
+    config : MeasurementConfig
+
+    Returns
+    -------
+    Measured
+        Without sizes and landmarks if the category is unknown.
+    """
+    fit = recognition.fit
+    if fit is None or recognition.category == UNKNOWN:
+        notice = Notice("untrusted", "no category fits the item; sizes are not given")
+        return Measured((), (), 0.0, 0.0, (notice,))
+    measurements = sizes(fit)
+    coverage = covered(fit, points)
+    quality = _quality(recognition, fit, measurements, coverage)
+    return Measured(
+        measurements=measurements,
+        landmarks=landmarks(fit, points, recognition.probabilities[recognition.category], config),
+        coverage=coverage,
+        quality=quality,
+        notices=_notices(recognition, measurements, coverage, quality, config),
+    )
+
+
+def sizes(fit: Fit) -> tuple[Measurement, ...]:
+    """Every size of the fitted category, width and length first."""
+    template = fit.template
+    found = template.measure(fit.state, fit.covariance[3:, 3:])
+    first = ["width", "length"]
+    placed = fit.points()
+    result = []
+    for name in [*first, *(n for n in found if n not in first)]:
+        value, sigma = found[name]
+        path = template.paths[name][0]
+        ends = (_pair(placed[path[0]]), _pair(placed[path[-1]]))
+        result.append(Measurement(name, value, sigma, not _seen(fit, name), ends))
+    return tuple(result)
+
+
+def _pair(point: Float) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
+
+
+def _seen(fit: Fit, name: str) -> bool:
+    """Whether the edges that bound a size were seen, on one side of the item at least."""
+    return any(_bounds_seen(fit, path) for path in fit.template.paths[name])
+
+
+def _bounds_seen(fit: Fit, path: Float, enough: float = 0.25) -> bool:
+    """A size is bounded, at either end, by an edge across its direction there."""
+    points = fit.points()
+    ends = ((path[0], points[path[0]] - points[path[1]]), (path[-1], points[path[-1]] - points[path[-2]]))
+    return all(_edge_seen(fit, points[i], way / np.linalg.norm(way), enough) for i, way in ends)
+
+
+def _edge_seen(fit: Fit, at: Float, way: Float, enough: float) -> bool:
+    outline = fit.points()[: fit.template.vertices]
+    step = np.roll(outline, -1, axis=0) - outline
+    length = np.linalg.norm(step, axis=1)
+    along = np.clip(((at - outline) * step).sum(axis=1) / np.maximum(length, 1e-9) ** 2, 0.0, 1.0)
+    away = np.linalg.norm(outline + along[:, None] * step - at, axis=1)
+    normal = np.column_stack([step[:, 1], -step[:, 0]]) / np.maximum(length, 1e-9)[:, None]
+    bounding = (away < away.min() + 0.01) & (normal @ way > 0.5)
+    if not bounding.any():
+        bounding = away < away.min() + 0.01
+    return bool((fit.edge_seen[bounding].mean(axis=1) >= enough).any())
+
+
+def covered(fit: Fit, points: FlatPoints) -> float:
+    """Share of the fitted outline's area that lies near seen points."""
+    outline = fit.points()[: fit.template.vertices]
+    seen = points.uv[~points.inferred]
+    if len(seen) < 2:
+        return 0.0
+    low = outline.min(axis=0)
+    cols, rows = np.ceil((outline.max(axis=0) - low) / CELL_M).astype(int) + 1
+    image = np.zeros((rows, cols), dtype=np.uint8)
+    cv2.fillPoly(image, [np.rint((outline - low) / CELL_M * 16).astype(np.int32)], 1, shift=4)
+    cells = low + CELL_M * np.argwhere(image)[:, ::-1]
+    tree = cKDTree(seen)
+    spacing = float(np.median(tree.query(seen, k=2)[0][:, 1]))
+    near = tree.query(cells)[0] < max(1.5 * CELL_M, 2.0 * spacing)
+    return float(near.mean())
+
+
+def landmarks(
+    fit: Fit, points: FlatPoints, probability: float, config: MeasurementConfig
+) -> tuple[Landmark, ...]:
+    """Every named point: its flat place from the fit, its hanging place from what was seen there."""
+    placed, slope = place(fit.template, fit.pose, fit.state)
+    variance = np.einsum("pim,mn,pin->pi", slope, fit.covariance, slope)
+    sigma = np.sqrt(variance.mean(axis=1))
+    seen = np.nonzero(~points.inferred)[0]
+    tree = cKDTree(points.uv[seen]) if len(seen) else None
+    result = []
+    for name, i in fit.template.landmarks.items():
+        near = (
+            seen[np.sort(np.array(tree.query_ball_point(placed[i], config.landmark_radius_m), np.int64))]
+            if tree is not None
+            else seen
+        )
+        result.append(_landmark(name, placed[i], float(sigma[i]), points, near, probability, config))
+    return tuple(result)
+
+
+def _landmark(
+    name: str,
+    at: Float,
+    sigma: float,
+    points: FlatPoints,
+    near: Float,
+    probability: float,
+    config: MeasurementConfig,
+) -> Landmark:
+    if not len(near):
+        certainty = 0.25 * probability * float(np.exp(-((sigma / 0.05) ** 2)))
+        return Landmark(name, _pair(at), sigma, None, float("nan"), (), certainty)
+    distance = np.linalg.norm(points.uv[near] - at, axis=1)
+    layer = _layer(points.xyz_hanger[near], distance, config.layer_gap_m)
+    near, distance = near[layer], distance[layer]
+    weight = np.exp(-0.5 * (distance / 0.006) ** 2) + 1e-6
+    weight /= weight.sum()
+    xyz = weight @ points.xyz_hanger[near]
+    spread = np.sqrt(weight @ ((points.xyz_hanger[near] - xyz) ** 2).sum(axis=1))
+    xyz_sigma = float(np.sqrt(sigma**2 + spread**2 / 3.0 + distance.min() ** 2))
+    ids = points.view_id[near]
+    views = sorted({int(v) for v in ids if v >= 0}, key=lambda v: (distance[ids == v].min(), v))
+    certainty = probability * float(np.exp(-((xyz_sigma / 0.05) ** 2)))
+    place_3d = (float(xyz[0]), float(xyz[1]), float(xyz[2]))
+    return Landmark(name, _pair(at), sigma, place_3d, xyz_sigma, tuple(views), certainty)
+
+
+def _layer(xyz: Float, distance: Float, gap: float) -> Float:
+    """Which points hang on the layer of the point that is nearest in the flat plane."""
+    reached = np.zeros(len(xyz), dtype=bool)
+    reached[distance.argmin()] = True
+    pairs = cKDTree(xyz).query_pairs(gap, output_type="ndarray")
+    while True:
+        grown = reached.copy()
+        grown[pairs[reached[pairs[:, 0]], 1]] = True
+        grown[pairs[reached[pairs[:, 1]], 0]] = True
+        if (grown == reached).all():
+            return reached
+        reached = grown
+
+
+def _quality(
+    recognition: Recognition, fit: Fit, measurements: tuple[Measurement, ...], coverage: float
+) -> float:
+    relative = max(m.sigma_m / m.value_m for m in measurements[:2])
+    doubt = relative / 0.05 + (1.0 - coverage) + (1.0 - fit.explained)
+    return float(recognition.probabilities[recognition.category] * np.exp(-0.5 * doubt))
+
+
+def _notices(
+    recognition: Recognition,
+    measurements: tuple[Measurement, ...],
+    coverage: float,
+    quality: float,
+    config: MeasurementConfig,
+) -> tuple[Notice, ...]:
+    notices = []
+    for size in measurements[:2]:
+        if size.inferred:
+            text = f"{size.name} {size.value_m:.3f} m rests on a part of the item that no view shows"
+            notices.append(Notice(f"{size.name}_unseen", text))
+    if coverage < config.low_coverage:
+        text = f"{100 * coverage:.0f} % of the item was seen"
+        notices.append(Notice("low_coverage", text))
+    order = sorted(recognition.probabilities.items(), key=lambda item: -item[1])
+    if len(order) > 1 and order[1][1] > 0.2:
+        text = f"{order[0][0]} {order[0][1]:.2f}, {order[1][0]} {order[1][1]:.2f}"
+        notices.append(Notice("category_uncertain", text))
+    if quality < config.trusted_quality:
+        notices.append(Notice("untrusted", f"quality {quality:.2f}: do not use the sizes"))
+    return tuple(notices)

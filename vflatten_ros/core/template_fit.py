@@ -1,0 +1,275 @@
+"""Fits a family of outlines to a flattened item: pose, sizes and turned parts at once.
+
+Robust Gauss-Newton on signed distances, from many rotations together. Three kinds of evidence:
+points of the seen outline lie on the template's; points of the template's outline lie on the seen
+one, unless that part was not seen; and flattened points lie inside the template.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vflatten_ros.core.templates import Float, Template
+
+Bool = NDArray[np.bool_]
+
+CELL_M = 0.004  # of the distance image of the seen outline
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What was seen, prepared once for all templates."""
+
+    outline: Float  # (n, 2) evenly spaced points of the outline, m
+    normal: Float  # (n, 2) outward
+    sigma: Float  # (n,) m
+    weight: Float  # (n,) independent observations that a point stands for; 0: not seen
+    inner: Float  # (q, 2) flattened points
+    inner_sigma: Float  # (q,)
+    inner_weight: Float  # (q,)
+    origin: Float  # (2,) of the distance image
+    distance: Float  # (rows, cols) signed distance to the outline, inside negative, m
+    slope: Float  # (rows, cols, 2) its gradient
+    seen: Float  # (rows, cols) 1 where the nearest part of the outline was seen
+    centre: Float  # (2,)
+    area: float  # m2
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The best pose and cut of one template."""
+
+    template: Template
+    pose: Float  # (3,) rotation rad, u, v of the template in the flat frame
+    state: Float  # (m,) of the template
+    covariance: Float  # (3 + m, 3 + m) of pose and state
+    energy: float  # negative logarithm of the posterior, up to a constant
+    evidence: float  # logarithm of the evidence, up to the same constant
+    residual_m: float  # robust rms distance of the seen outline
+    explained: float  # 0-1, share of the seen outline that lies on the template's
+    edge_seen: Float  # (e, s) 0-1: how well each sample of each template edge is seen
+
+    def points(self) -> Float:
+        """(p, 2) all points of the template in the flat frame."""
+        return place(self.template, self.pose, self.state)[0]
+
+
+def place(template: Template, pose: Float, state: Float) -> tuple[Float, Float]:
+    """Points of the template in the flat frame, (..., p, 2), and their slope, (..., p, 2, 3 + m)."""
+    local, by_state = template.place(state)
+    cos, sin = np.cos(pose[..., 0]), np.sin(pose[..., 0])
+    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)[..., None, :, :]
+    arm = (turn @ local[..., None])[..., 0]
+    slope = np.empty((*local.shape, 3 + template.dimensions))
+    slope[..., 0, 0], slope[..., 1, 0] = -arm[..., 1], arm[..., 0]
+    slope[..., 1:3] = np.eye(2)
+    slope[..., 3:] = turn @ by_state
+    return arm + pose[..., None, 1:], slope
+
+
+def starts(template: Template, evidence: Evidence, rotations: int) -> tuple[Float, Float]:
+    """Typical cuts of the seen area in every direction: poses (r, 3) and states (r, m)."""
+    typical = template.outline(np.zeros(template.dimensions))
+    area, centre = _moments(typical)
+    hull = evidence.outline
+    extent = np.linalg.norm(hull - evidence.centre, axis=1).max()
+    reach = np.linalg.norm(typical - centre, axis=1).max()
+    scale = 0.5 * np.log(extent / reach) + 0.25 * np.log(evidence.area / area)
+    roots = np.abs(template.log_spread).astype(bool).sum(axis=1) == 1
+    state = np.zeros(template.dimensions)
+    state[: len(template.sizes)][roots] = scale / np.diagonal(template.log_spread)[roots]
+    centre = _moments(template.outline(state))[1]
+    angle = np.arange(rotations) * (2.0 * np.pi / rotations)
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = np.stack([cos * centre[0] - sin * centre[1], sin * centre[0] + cos * centre[1]], -1)
+    poses = np.column_stack([angle, evidence.centre - turned])
+    return poses, np.tile(state, (rotations, 1))
+
+
+def _moments(outline: Float) -> tuple[float, Float]:
+    after = np.roll(outline, -1, axis=0)
+    cross = outline[:, 0] * after[:, 1] - outline[:, 1] * after[:, 0]
+    area = 0.5 * float(cross.sum())
+    return abs(area), (cross[:, None] * (outline + after)).sum(axis=0) / (6.0 * area)
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Weighted normal equations of a batch of hypotheses, without the prior."""
+
+    hessian: Float  # (b, 3 + m, 3 + m)
+    gradient: Float  # (b, 3 + m)
+    energy: Float  # (b,)
+
+
+def linearise(
+    template: Template, evidence: Evidence, pose: Float, state: Float, cut: float, outside_cut: float
+) -> _System:
+    """Robust normal equations at (b, 3) poses and (b, m) states."""
+    points, slope = place(template, pose, state)
+    k = template.vertices
+    outline, moves = points[:, :k], slope[:, :k]
+    terms = [
+        _seen_on_template(evidence, outline, moves, cut, outside_cut),
+        _template_on_seen(evidence, outline, moves, cut),
+    ]
+    if len(evidence.inner):
+        terms.append(_inner_in_template(evidence, outline, moves, outside_cut))
+    rows = np.concatenate([t[0] for t in terms], axis=1)  # (b, r, 3 + m)
+    residual = np.concatenate([t[1] for t in terms], axis=1)
+    weight = np.concatenate([t[2] for t in terms], axis=1)
+    energy = np.concatenate([t[3] for t in terms], axis=1).sum(axis=1)
+    weighted = rows * weight[..., None]
+    return _System(
+        np.swapaxes(weighted, 1, 2) @ rows, (weighted * residual[..., None]).sum(axis=1), energy
+    )
+
+
+def _geman_mcclure(residual: Float, weight: Float, cut: Float | float) -> tuple[Float, Float]:
+    """Weights of least squares and energies: quadratic for small residuals, level beyond `cut`."""
+    soft = 1.0 + (residual / cut) ** 2
+    return weight / soft**2, 0.5 * weight * residual**2 / soft
+
+
+def _nearest_edge(
+    query: Float, normal: Float | None, outline: Float
+) -> tuple[NDArray[np.int64], Float, Float, Float]:
+    """Edge, place along it, signed distance and direction from the nearest of (b, k) edges.
+
+    Edges that face another way than the point's normal count as farther: the two sides of a narrow
+    gap must not be mistaken for one another.
+    """
+    step = np.roll(outline, -1, axis=1) - outline  # (b, k, 2)
+    length2 = np.maximum((step**2).sum(-1), 1e-12)
+    from_start = query[None, :, None] - outline[:, None]  # (b, n, k, 2)
+    along = np.clip((from_start * step[:, None]).sum(-1) / length2[:, None], 0.0, 1.0)
+    away = from_start - along[..., None] * step[:, None]
+    outward = np.stack([step[..., 1], -step[..., 0]], -1) / np.sqrt(length2)[..., None]
+    square = (away**2).sum(-1)
+    across = (away * outward[:, None]).sum(-1)
+    cost = square - 1e-3 * across**2  # at a corner: the edge that faces the point
+    if normal is not None:
+        cost = cost + 0.03**2 * (1.0 - np.einsum("ni,bki->bnk", normal, outward))
+    edge = cost.argmin(-1)
+    pick = edge[..., None]
+    distance = np.sqrt(np.take_along_axis(square, pick, -1)[..., 0])
+    side = np.sign(np.take_along_axis(across, pick, -1)[..., 0])
+    vector = np.take_along_axis(away, pick[..., None], 2)[..., 0, :]
+    flat = np.take_along_axis(outward, pick[..., 0][..., None], 1)
+    far = distance > 1e-6
+    direction = np.where(
+        far[..., None], vector * (side / np.maximum(distance, 1e-9))[..., None], flat
+    )
+    return edge, np.take_along_axis(along, pick, -1)[..., 0], side * distance, direction
+
+
+def _rows(edge: NDArray[np.int64], along: Float, direction: Float, moves: Float) -> Float:
+    """Derivative (b, n, 3 + m) of the distances from points to the template's edges."""
+    batch = np.arange(len(moves))[:, None]
+    start, end = moves[batch, edge], moves[batch, (edge + 1) % moves.shape[1]]
+    start_part = direction * (along - 1.0)[..., None]
+    end_part = direction * -along[..., None]
+    return np.einsum("bni,bnim->bnm", start_part, start) + np.einsum("bni,bnim->bnm", end_part, end)
+
+
+def _seen_on_template(
+    evidence: Evidence, outline: Float, moves: Float, cut: float, outside_cut: float
+) -> tuple[Float, Float, Float, Float]:
+    edge, along, distance, direction = _nearest_edge(evidence.outline, evidence.normal, outline)
+    residual = distance / evidence.sigma
+    own_cut = np.where(residual > 0.0, outside_cut, cut)
+    weight, energy = _geman_mcclure(residual, evidence.weight, own_cut)
+    return _rows(edge, along, direction, moves) / evidence.sigma[:, None], residual, weight, energy
+
+
+def _inner_in_template(
+    evidence: Evidence, outline: Float, moves: Float, outside_cut: float
+) -> tuple[Float, Float, Float, Float]:
+    edge, along, distance, direction = _nearest_edge(evidence.inner, None, outline)
+    residual = np.maximum(distance, 0.0) / evidence.inner_sigma
+    weight, energy = _geman_mcclure(residual, evidence.inner_weight, outside_cut)
+    rows = _rows(edge, along, direction, moves) / evidence.inner_sigma[:, None]
+    return rows * (distance > 0.0)[..., None], residual, weight, energy
+
+
+def _template_on_seen(
+    evidence: Evidence, outline: Float, moves: Float, cut: float
+) -> tuple[Float, Float, Float, Float]:
+    b, k = outline.shape[:2]
+    samples = samples_per_edge(k)
+    share = (np.arange(samples) + 0.5) / samples
+    after, after_moves = np.roll(outline, -1, axis=1), np.roll(moves, -1, axis=1)
+    place_ = outline[:, :, None] * (1 - share)[:, None] + after[:, :, None] * share[:, None]
+    length = np.linalg.norm(after - outline, axis=-1)
+    distance, slope, seen = look_up(evidence, place_.reshape(b, k * samples, 2))
+    slope = slope.reshape(b, k, samples, 2)
+    rows = np.einsum("bksi,bkim,s->bksm", slope, moves, 1 - share)
+    rows += np.einsum("bksi,bkim,s->bksm", slope, after_moves, share)
+    sigma = float(np.median(evidence.sigma))
+    each = np.repeat(length / samples, samples, axis=1) * (evidence.weight.sum() / _perimeter(evidence))
+    residual = distance / sigma
+    weight, energy = _geman_mcclure(residual, each * seen, cut)
+    return rows.reshape(b, k * samples, -1) / sigma, residual, weight, energy
+
+
+def _perimeter(evidence: Evidence) -> float:
+    return float(np.linalg.norm(np.roll(evidence.outline, -1, 0) - evidence.outline, axis=1).sum())
+
+
+def samples_per_edge(edges: int) -> int:
+    """Samples of every edge: about 80 in all."""
+    return max(4, round(80 / edges))
+
+
+def look_up(evidence: Evidence, at: Float) -> tuple[Float, Float, Float]:
+    """Signed distance to the seen outline, its gradient, and whether that part was seen."""
+    rows, cols = evidence.distance.shape
+    cell = (at - evidence.origin) / CELL_M
+    inside = np.clip(cell, 0.0, np.array([cols, rows]) - 1.001)
+    beyond = np.linalg.norm(cell - inside, axis=-1) * CELL_M
+    low = inside.astype(np.int64)
+    u, v = np.moveaxis(inside - low, -1, 0)
+    i, j = low[..., 1], low[..., 0]
+    image = evidence.distance
+    value = (image[i, j] * (1 - u) + image[i, j + 1] * u) * (1 - v)
+    value += (image[i + 1, j] * (1 - u) + image[i + 1, j + 1] * u) * v
+    return value + beyond, evidence.slope[i, j], evidence.seen[i, j]
+
+
+def refine(
+    template: Template,
+    evidence: Evidence,
+    pose: Float,
+    state: Float,
+    cuts: tuple[float, ...],
+    outside_factor: float,
+) -> tuple[Float, Float, Float]:
+    """Robust Gauss-Newton from (b, 3) poses and (b, m) states; one step for every cut.
+
+    Returns
+    -------
+    pose, state : ndarray
+        The best of the steps made with the last cut.
+    energy : ndarray of shape (b,)
+        Theirs.
+    """
+    limit = np.r_[0.3, 0.08, 0.08, np.full(template.dimensions, 1.0)]
+    prior = np.r_[0.0, 0.0, 0.0, np.ones(template.dimensions)]
+    damping = np.diag(prior + np.r_[1.0, 1.0, 1.0, np.zeros(template.dimensions)])
+    x = np.concatenate([pose, state], axis=1)
+    best_x, best = x, np.full(len(x), np.inf)
+    for cut in cuts:
+        system = linearise(template, evidence, x[:, :3], x[:, 3:], cut, outside_factor * cut)
+        energy = system.energy + 0.5 * (x[:, 3:] ** 2).sum(axis=1)
+        if cut == cuts[-1]:
+            better = energy < best
+            best_x, best = np.where(better[:, None], x, best_x), np.where(better, energy, best)
+        step = np.linalg.solve(
+            system.hessian + damping, -(system.gradient + prior * x)[..., None]
+        )[..., 0]
+        over = np.abs(step / limit).max(axis=1, keepdims=True)
+        x = x + step / np.maximum(over, 1.0)
+    return best_x[:, :3], best_x[:, 3:], best

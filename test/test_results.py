@@ -1,0 +1,91 @@
+"""The JSON object: keys, frames, and identity with the messages."""
+
+import json
+
+import numpy as np
+import pytest
+
+from garments import CALIBRATION, example_garment, example_views
+from vflatten_ros import messages, results
+from vflatten_ros.core.geometry import rotation_about
+
+VIEWS = example_views()
+GARMENT = example_garment(VIEWS)
+RESULT = results.garment_result(GARMENT, VIEWS)
+
+
+def test_sizes_category_and_notices():
+    assert RESULT["category"] == "towel"
+    assert RESULT["scores"]["towel"] == pytest.approx(0.81)
+    assert (RESULT["width_m"], RESULT["width_sigma_m"]) == (0.30, 0.003)
+    assert (RESULT["length_m"], RESULT["length_sigma_m"]) == (0.50, 0.004)
+    assert RESULT["notices"][0]["code"] == "length_unseen"
+    assert RESULT["warnings"] == ["the lower left corner is in no view"]
+    assert [view["id"] for view in RESULT["views"]] == [2, 5]
+
+
+def test_every_point_is_a_pixel_of_its_view():
+    points = RESULT["points"]
+    assert len({len(column) for column in points.values()}) == 1
+    pixels = {(v.view_id, *pixel) for v in VIEWS for pixel in v.pixel.tolist()}
+    given = list(zip(points["view"], points["row"], points["col"], strict=True))
+    assert len(given) == len(GARMENT.points.uv)
+    assert set(given) <= pixels
+
+
+def test_points_without_a_pixel_are_left_out():
+    fields = messages.flattened_view_fields(GARMENT, VIEWS)
+    fields["view"] = np.where(np.arange(len(fields["u"])) % 2, -1, fields["view"])
+    estimate = messages.garment_estimate_fields(GARMENT, VIEWS)
+    points = results.result_from_fields(fields, estimate, CALIBRATION)["points"]
+    assert len(points["u"]) == (len(fields["u"]) + 1) // 2
+    assert min(points["view"]) >= 0
+
+
+def test_landmarks_hang_in_the_rig_frame_with_the_item_turned_back_to_zero():
+    """As the recordings' truth has it: p0 + R(axis, -angle) (p - p0) of the measured point."""
+    mark = next(m for m in RESULT["landmarks"] if m["name"] == "right_top_corner")
+    view = VIEWS[0]
+    gap = np.linalg.norm(view.points_hanger - GARMENT.landmarks[1].xyz_hanger, axis=1)
+    measured = view.points_rig[gap.argmin()]
+    origin, axis = np.array(CALIBRATION.axis_point), np.array(CALIBRATION.axis_direction)
+    back = origin + rotation_about(axis, -view.angle_rad) @ (measured - origin)
+    assert mark["xyz"] == pytest.approx(back.tolist(), abs=0.002)  # one sample of the surface
+    assert mark["view"] == 2
+
+
+def test_an_unseen_landmark_hangs_nowhere():
+    mark = RESULT["landmarks"][2]
+    assert mark["name"] == "left_bottom_corner"
+    assert mark["xyz"] is None
+    assert mark["view"] is None
+    assert mark["uv"] == [-0.15, -0.5]
+
+
+def test_numbers_equal_the_message_fields_exactly():
+    fields = messages.flattened_view_fields(GARMENT, VIEWS)
+    read_back = json.loads(results.json_text(RESULT))
+    assert read_back["points"]["u"] == [float(v) for v in fields["u"]]
+    assert [p[1] for p in read_back["contour_uv"]] == [float(v) for v in fields["contour_v"]]
+
+
+def test_what_was_not_measured_is_null():
+    estimate = {**messages.garment_estimate_fields(GARMENT, VIEWS), "measurements": []}
+    fields = messages.flattened_view_fields(GARMENT, VIEWS)
+    result = results.result_from_fields(fields, estimate, CALIBRATION)
+    assert result["width_m"] is None
+    assert result["length_sigma_m"] is None
+
+
+def test_the_text_is_valid_json_without_nan(tmp_path):
+    path = tmp_path / "result.json"
+    results.write_json(path, {**RESULT, "odd": [float("nan"), {"x": float("inf")}]})
+    read_back = json.loads(path.read_text())
+    assert read_back["odd"] == [None, {"x": None}]
+    assert read_back["category"] == "towel"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_same_garment_gives_the_same_bytes():
+    again = results.garment_result(example_garment(), example_views())
+    assert results.json_text(again) == results.json_text(RESULT)

@@ -59,7 +59,7 @@ class JointConfig(Checked):
     """Wrist angle at a cloud's stamp."""
 
     max_age_s: float = option(
-        0.1, "Farthest a joint state may be from a cloud's stamp, s.", low=0.001, high=10.0
+        0.1, "Farthest either joint state may be from the cloud's stamp between them, s.", low=0.001, high=10.0
     )
     wait_s: float = option(
         1.0, "How long a cloud waits for its joint states, s.", low=0.0, high=60.0
@@ -111,8 +111,38 @@ class BufferConfig(Checked):
 
     max_views: int = option(128, "Most views kept at a time.", low=2, high=10000)
     max_megabytes: float = option(512.0, "Most memory for views, MB.", low=1.0, high=65536.0)
+    max_waiting: int = option(
+        64, "Most clouds that wait for joint states at a time.", low=1, high=1000
+    )
     duplicate_angle_deg: float = option(
         2.0, "Views nearer in angle replace one another, the better stays, deg.", low=0.0, high=45.0
+    )
+    max_rate_rad_s: float = option(
+        0.0, "Clouds taken while the wrist turns faster are dropped, rad/s; 0: never.", low=0.0, high=100.0
+    )
+    swing_m: float = option(
+        0.03,
+        "An item whose middle moved by more at the same angle has swung: the newer view stays, m; "
+        "0: not checked.",
+        low=0.0,
+        high=1.0,
+    )
+    max_gap_deg: float = option(
+        45.0, "Largest angle between neighbouring views of a complete rotation, deg.", low=1.0, high=180.0
+    )
+    min_views: int = option(6, "Fewest views of a complete rotation.", low=2, high=1000)
+    clock_jump_s: float = option(
+        1.0, "Stamps that step back by more mean that the clock was set back, s.", low=0.01, high=3600.0
+    )
+    finger_joints: str = option(
+        "finger_left,finger_right",
+        "Joints whose opening and closing starts a new item, by commas; empty: none.",
+    )
+    finger_open: float = option(
+        0.02, "Fingers are open where their mean position is above this, m or rad.", low=-10.0, high=10.0
+    )
+    finger_closed: float = option(
+        0.01, "Open fingers are closed again below this, m or rad.", low=-10.0, high=10.0
     )
 
 
@@ -133,6 +163,25 @@ class BoundaryConfig(Checked):
     """Points on the boundary of the observed region (paper, section 3)."""
 
     spacing_m: float = option(0.02, "Distance between boundary points, m.", low=0.002, high=0.2)
+
+
+@dataclass(frozen=True)
+class PatchConfig(Checked):
+    """Parts of a view that no crease and no depth jump cuts apart."""
+
+    step_m: float = option(
+        0.003, "Smallest step between neighbouring pixels that parts two layers, m.", low=1e-4, high=0.1
+    )
+    step_sigmas: float = option(
+        4.0, "The same in standard deviations of the steps that noise makes.", low=1.0, high=20.0
+    )
+    lone_step_m: float = option(
+        0.008, "The same where too few pixels are around for the slopes, m.", low=1e-4, high=0.1
+    )
+    jump_m: float = option(
+        0.03, "Change of depth to the next pixel that is a step on any slope, m.", low=0.001, high=1.0
+    )
+    min_points: int = option(40, "Patches of fewer pixels are left out.", low=3, high=100000)
 
 
 @dataclass(frozen=True)
@@ -235,6 +284,15 @@ class RotationConfig(Checked):
         0.3, "Least share of neighbours that linked samples have in common.", low=0.0, high=1.0
     )
     rim_m: float = option(0.007, "Longest link round a sharp rim, m.", low=0.001, high=0.05)
+    landmarks: int = option(
+        400, "Samples whose mutual distances are unfolded.", low=50, high=5000
+    )
+    local_m: float = option(
+        0.15, "Nearer pairs on one sheet keep their distance both ways, m.", low=0.01, high=2.0
+    )
+    unfold_rounds: int = option(
+        15, "Reweightings at each strength of spreading.", low=1, high=1000
+    )
 
 
 @dataclass(frozen=True)
@@ -247,6 +305,7 @@ class Config:
     buffer: BufferConfig = BufferConfig()
     surface: SurfaceConfig = SurfaceConfig()
     boundary: BoundaryConfig = BoundaryConfig()
+    patches: PatchConfig = PatchConfig()
     geodesics: GeodesicConfig = GeodesicConfig()
     flattening: FlatteningConfig = FlatteningConfig()
     contour: ContourConfig = ContourConfig()

@@ -1,0 +1,143 @@
+"""All views' points -> evenly spread samples of the surface, each on its own layer.
+
+Two layers of cloth may hang a millimetre or two apart. A sample is therefore fitted only to points
+whose normals agree with its own and whose height above it lies within a band that narrows as the
+fit settles: the other layer drops out instead of being averaged in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.values import Bool, Float, Int
+
+NEIGHBOURS = 64  # points used for one fit
+CHUNK = 4096  # samples fitted at a time: bounds the memory
+BANDS_M = (0.003, 0.002, 0.0015)  # height (Gaussian) of the successive fits
+MIN_CELL = 3  # points that make a sample
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples of the outside of the cloth, hanger frame."""
+
+    xyz: Float  # (n, 3)
+    normal: Float  # (n, 3) unit, outwards
+    sigma_m: Float  # (n,) standard deviation along the normal
+    source: Int  # (n,) row, among all points, of the measured point nearest to the sample
+    views: Bool  # (n, view) which views see it
+
+
+def fuse(points: Float, normals: Float, view: Int, config: RotationConfig) -> Samples:
+    """Samples about `spacing_m` apart on every layer that any view saw.
+
+    Parameters
+    ----------
+    points, normals : ndarray of shape (n, 3)
+        Registered points of all views and their outward normals, common frame.
+    view : ndarray of shape (n,)
+        Which view each point comes from, from 0.
+    """
+    start, direction = _cells(points, normals, config.spacing_m)
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    parts = [
+        _fit(start[a : a + CHUNK], direction[a : a + CHUNK], points, normals, view, tree, config)
+        for a in range(0, len(start), CHUNK)
+    ]
+    joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+    xyz, normal, sigma, source, seen = joined
+    keep = _thinned(xyz, normal, sigma, 0.55 * config.spacing_m)
+    return Samples(xyz[keep], normal[keep], sigma[keep], source[keep], seen[keep])
+
+
+def _cells(points: Float, normals: Float, size_m: float) -> tuple[Float, Float]:
+    """Mean point and normal of each cube and direction (of six) that holds enough points."""
+    lead = np.abs(normals).argmax(1)
+    sign = normals[np.arange(len(normals)), lead] > 0
+    grid = np.floor((points - points.min(0)) / size_m).astype(np.int64)
+    extent = grid.max(0) + 1
+    key = ((grid[:, 0] * extent[1] + grid[:, 1]) * extent[2] + grid[:, 2]) * 6 + 2 * lead + sign
+    _, cell, count = np.unique(key, return_inverse=True, return_counts=True)
+    sums = np.stack(
+        [np.bincount(cell, column) for column in np.hstack([points, normals]).T], axis=1
+    )
+    sums = sums[count >= MIN_CELL] / count[count >= MIN_CELL, None]
+    direction = sums[:, 3:] / np.linalg.norm(sums[:, 3:], axis=1, keepdims=True)
+    return sums[:, :3], direction
+
+
+def _fit(
+    at: Float,
+    normal: Float,
+    points: Float,
+    normals: Float,
+    view: Int,
+    tree: cKDTree,
+    config: RotationConfig,
+) -> tuple[Float, Float, Float, Int, Bool]:
+    """Move samples onto their own layer by local fits: planes first, a quadric last."""
+    radius = config.fit_m
+    distance, near = tree.query(at, k=NEIGHBOURS, distance_upper_bound=radius * 1.2)
+    found = np.isfinite(distance)
+    near = np.where(found, near, 0)
+    around, their_normals = points[near], normals[near]
+    for band in BANDS_M:
+        alike = np.matmul(their_normals, normal[..., None])[..., 0] > 0.5
+        e1, e2 = _tangents(normal)
+        local = np.matmul(around - at[:, None], np.stack([e1, e2, normal], axis=-1))
+        x, y, height = local[..., 0] / radius, local[..., 1] / radius, local[..., 2]
+        weight = (1 - (x * x + y * y).clip(0, 1)) ** 2 * np.exp(-0.5 * (height / band) ** 2)
+        weight = np.where(found & alike, weight, 0.0)
+        basis = [np.ones_like(x), x, y]
+        if band == BANDS_M[-1]:
+            basis += [x * x, x * y, y * y]
+        design = np.stack(basis, axis=1)  # (n, terms, k)
+        weighted = design * weight[:, None]
+        matrix = weighted @ design.transpose(0, 2, 1) + 1e-3 * np.eye(len(basis))
+        solved = np.linalg.solve(matrix, weighted @ height[..., None])[..., 0]
+        at = at + solved[:, :1] * normal
+        normal = normal - (solved[:, 1:2] * e1 + solved[:, 2:3] * e2) / radius
+        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    sigma = config.noise_m * np.sqrt(1 / np.maximum(weight.sum(1), 0.05))
+    inside = np.where(weight > 0.05, distance, np.inf)
+    nearest = inside.argmin(1)
+    rows = np.arange(len(at))
+    source = np.where(np.isfinite(inside[rows, nearest]), near[rows, nearest], -1)
+    seen = np.zeros((len(at), int(view.max()) + 1), dtype=bool)
+    row, column = np.nonzero(weight > 0.3)
+    seen[row, view[near[row, column]]] = True
+    return at, normal, sigma, source.astype(np.int64), seen
+
+
+def _tangents(normal: Float) -> tuple[Float, Float]:
+    """Two unit vectors that make a right-handed frame with each normal."""
+    least = np.abs(normal).argmin(1)
+    e1 = np.cross(normal, np.eye(3)[least])
+    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    return e1, np.cross(normal, e1)
+
+
+def _thinned(xyz: Float, normal: Float, sigma: Float, apart_m: float) -> Bool:
+    """Drop samples without support, and of two on one layer nearer than apart_m the vaguer one."""
+    keep = np.isfinite(xyz).all(1) & (sigma < 4 * sigma.min())
+    a, b = cKDTree(xyz).query_pairs(apart_m, output_type="ndarray").T
+    same = (normal[a] * normal[b]).sum(1) > 0.7
+    a, b = a[same], b[same]
+    worse = np.where((sigma[a] > sigma[b]) | ((sigma[a] == sigma[b]) & (a > b)), a, b)
+    better = a + b - worse
+    for _ in range(8):  # a sample falls only to one that itself stays
+        falls = np.zeros(len(xyz), dtype=bool)
+        falls[worse[keep[better] & keep[worse]]] = True
+        stays = keep & ~falls
+        drop = np.zeros(len(xyz), dtype=bool)
+        drop[worse[stays[better]]] = True
+        drop &= keep
+        if not drop.any():
+            break
+        keep = keep & ~drop
+    return keep

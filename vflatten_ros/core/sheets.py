@@ -1,0 +1,97 @@
+"""Which samples are neighbours on the cloth: links on one sheet, and links round sharp rims.
+
+Where the edge of one layer lies on another, their samples are as near as neighbours are. The chord
+of a smooth surface is square to the mean of the normals at its ends, however curved the surface;
+where it is not, there is a step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.values import Bool, Float, Int
+
+RIM_GAP_RAD = np.radians(120)  # a sample with no neighbour in so wide a sector is at an edge
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Pairs of neighbouring samples."""
+
+    a: Int  # (m,) smaller row
+    b: Int  # (m,)
+    length_m: Float  # (m,) along the cloth
+    rim: Bool  # (m,) round a sharp edge, rather than on one sheet
+
+
+def link_samples(xyz: Float, normal: Float, config: RotationConfig) -> Links:
+    """Links of every sample to those around it on its own sheet and round its edge.
+
+    Parameters
+    ----------
+    xyz, normal : ndarray of shape (n, 3)
+        Samples and their outward normals.
+    """
+    a, b = cKDTree(xyz).query_pairs(config.link_m, output_type="ndarray").T
+    chord = xyz[b] - xyz[a]
+    alike = (normal[a] * normal[b]).sum(1)
+    mean = normal[a] + normal[b]
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    length = np.linalg.norm(chord, axis=1)
+    sheet = (alike > 0.5) & (np.abs((chord * mean).sum(1)) < config.step_m)
+    sheet = _supported(a, b, sheet, len(xyz), config)
+    edge = _at_edge(a[sheet], b[sheet], xyz, normal)
+    rim = ~sheet & edge[a] & edge[b] & (alike < 0.3) & (length < config.rim_m)
+    keep = sheet | rim
+    return Links(a[keep], b[keep], _arc(length, alike)[keep], rim[keep])
+
+
+def _arc(chord: Float, alike: Float) -> Float:
+    """Length of the circular arc over each chord, from the cosine of the angle between its normals."""
+    half = np.arccos(alike.clip(0.3, 1.0)) / 2
+    return chord * np.where(half > 1e-3, half / np.maximum(np.sin(half), 1e-3), 1.0)
+
+
+def _supported(a: Int, b: Int, sheet: Bool, n: int, config: RotationConfig) -> Bool:
+    """Keep links whose ends share neighbours: on a sheet the neighbourhoods overlap."""
+    sheet = sheet.copy()
+    for _ in range(3):
+        rows = np.flatnonzero(sheet)
+        i, j = a[rows], b[rows]
+        ones = np.ones(2 * len(rows), dtype=np.float32)
+        adjacent = csr_matrix((ones, (np.r_[i, j], np.r_[j, i])), shape=(n, n))
+        degree = np.diff(adjacent.indptr)
+        common = np.asarray(adjacent[i].multiply(adjacent[j]).sum(1)).ravel()
+        weak = (common < config.overlap * np.minimum(degree[i], degree[j])) | (common < 2)
+        sheet[rows[weak]] = False
+    return sheet
+
+
+def _at_edge(a: Int, b: Int, xyz: Float, normal: Float) -> Bool:
+    """Samples whose linked neighbours leave a wide sector empty."""
+    n = len(xyz)
+    centre, other = np.r_[a, b], np.r_[b, a]
+    order = np.argsort(centre, kind="stable")
+    centre, other = centre[order], other[order]
+    least = np.abs(normal).argmin(1)
+    e1 = np.cross(normal, np.eye(3)[least])
+    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    e2 = np.cross(normal, e1)
+    offset = xyz[other] - xyz[centre]
+    angle = np.arctan2((offset * e2[centre]).sum(1), (offset * e1[centre]).sum(1))
+    order = np.lexsort((angle, centre))
+    angle = angle[order]
+    count = np.bincount(centre, minlength=n)
+    first = np.r_[0, np.cumsum(count)[:-1]]
+    last = first + count - 1
+    following = np.r_[angle[1:], 0.0]
+    some = count > 0
+    following[last[some]] = angle[first[some]] + 2 * np.pi
+    gap = np.full(n, 2 * np.pi)
+    gap[some] = np.maximum.reduceat(following - angle, first[some])
+    return gap > RIM_GAP_RAD

@@ -66,7 +66,9 @@ def calibration_from(values: Mapping[str, Any]) -> Calibration:
 def _number(values: Mapping[str, Any], key: str) -> float:
     value = values[key]
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InvalidCalibration(f"calibration: {key}: expected a number ({KEYS[key]}), got {value!r}")
+        raise InvalidCalibration(
+            f"calibration: {key}: expected a number ({KEYS[key]}), got {value!r}"
+        )
     return float(value)
 
 

@@ -29,9 +29,15 @@ class JointReading:
     """The joint at one stamp."""
 
     status: JointStatus
-    angle_rad: float = math.nan  # joint position, turns unwrapped
+    position_rad: float = math.nan  # as reported, between the samples
+    turns: int = 0  # whole turns to add since the first sample
     rate_rad_s: float = math.nan
-    age_s: float = math.nan  # to the nearest sample
+    age_s: float = math.nan  # to the farther of the samples used
+
+    @property
+    def angle_rad(self) -> float:
+        """Joint position, turns unwrapped."""
+        return self.position_rad + self.turns * TURN
 
 
 class JointTrack:
@@ -47,8 +53,8 @@ class JointTrack:
     def __init__(self, config: JointConfig) -> None:
         self._config = config
         self._stamps: list[int] = []
-        self._angles: list[float] = []
         self._reported: list[float] = []
+        self._turns: list[int] = []
         self._lowest = math.inf
         self._highest = -math.inf
 
@@ -68,8 +74,8 @@ class JointTrack:
     def clear(self) -> None:
         """Forget all samples; what is known of the joint's range stays."""
         self._stamps.clear()
-        self._angles.clear()
         self._reported.clear()
+        self._turns.clear()
 
     def add(self, stamp_ns: int, position_rad: float) -> bool:
         """Add one sample; False if it is not finite, a repeated stamp, or older than the history."""
@@ -82,13 +88,10 @@ class JointTrack:
             return False
         self._lowest = min(self._lowest, position_rad)
         self._highest = max(self._highest, position_rad)
-        neighbour = max(place - 1, 0)
-        angle = position_rad
-        if self._stamps:
-            angle = self._unwrapped(position_rad, self._reported[neighbour], self._angles[neighbour])
+        turns = self._turns_at(position_rad, max(place - 1, 0)) if self._stamps else 0
         self._stamps.insert(place, stamp_ns)
-        self._angles.insert(place, angle)
         self._reported.insert(place, position_rad)
+        self._turns.insert(place, turns)
         self._forget()
         return True
 
@@ -127,17 +130,22 @@ class JointTrack:
         if age_s > self._config.max_age_s:
             return JointReading(JointStatus.TOO_OLD, age_s=age_s)
         last = len(self._stamps) - 1
-        return JointReading(JointStatus.OK, self._angles[last], self._rate(last, last), age_s)
+        rate = self._rate(last, last)
+        return JointReading(JointStatus.OK, self._reported[last], self._turns[last], rate, age_s)
 
     @property
     def _history_ns(self) -> int:
         return int(self._config.history_s * 1e9)
 
-    def _unwrapped(self, position: float, reported: float, angle: float) -> float:
-        step = position - reported
-        if not self._counts_turns():
-            step -= TURN * round(step / TURN)
-        return angle + step
+    def _turns_at(self, position: float, neighbour: int) -> int:
+        """Turns to add to a position beside a sample."""
+        if self._counts_turns():
+            return self._turns[neighbour]
+        return self._turns[neighbour] - round((position - self._reported[neighbour]) / TURN)
+
+    def _step(self, before: int, after: int) -> float:
+        turns = self._turns[after] - self._turns[before]
+        return self._reported[after] - self._reported[before] + turns * TURN
 
     def _counts_turns(self) -> bool:
         low, high = self._lowest, self._highest
@@ -150,9 +158,9 @@ class JointTrack:
     def _interpolate(self, before: int, after: int, stamp_ns: int, age_s: float) -> JointReading:
         span = self._stamps[after] - self._stamps[before]
         share = (stamp_ns - self._stamps[before]) / span if span else 0.0
-        step = self._angles[after] - self._angles[before]
-        angle = self._angles[before] + share * step
-        return JointReading(JointStatus.OK, angle, self._rate(before, after), age_s)
+        position = self._reported[before] + share * self._step(before, after)
+        rate = self._rate(before, after)
+        return JointReading(JointStatus.OK, position, self._turns[before], rate, age_s)
 
     def _rate(self, before: int, after: int) -> float:
         """Mean rate over at least 40 ms about the samples, so that encoder noise does not count."""
@@ -162,11 +170,11 @@ class JointTrack:
                 break
             before, after = max(before - 1, 0), min(after + 1, last)
         span_s = (self._stamps[after] - self._stamps[before]) * 1e-9
-        return (self._angles[after] - self._angles[before]) / span_s if span_s else 0.0
+        return self._step(before, after) / span_s if span_s else 0.0
 
     def _forget(self) -> None:
         oldest = self._stamps[-1] - self._history_ns
         drop = max(bisect_left(self._stamps, oldest), len(self._stamps) - MAX_SAMPLES)
         # In blocks: removing from the front of a list costs its length.
         if drop > 256 or len(self._stamps) > MAX_SAMPLES:
-            del self._stamps[:drop], self._angles[:drop], self._reported[:drop]
+            del self._stamps[:drop], self._reported[:drop], self._turns[:drop]

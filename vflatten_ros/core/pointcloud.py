@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -86,7 +87,7 @@ def decode_cloud(
             f"cloud of {height} x {width} points needs {needed} bytes (point_step {point_step}, "
             f"row_step {row_step}), got {len(raw)}; the driver or the network lost a part"
         )
-    points = np.ndarray(
+    points: Byte = np.ndarray(
         (height, width, point_step),
         np.uint8,
         raw if needed else np.zeros(1, np.uint8),
@@ -132,9 +133,11 @@ def _check_field(field: PointField, point_step: int) -> None:
 
 def _check_overlap(fields: list[PointField]) -> None:
     spans = sorted((f.offset, f.offset + int(DATATYPES[f.datatype][1]), f.name) for f in fields)
-    for (_, end, first), (start, _, second) in zip(spans[:-1], spans[1:], strict=True):
+    for (_, end, first), (start, _, second) in pairwise(spans):
         if start < end:
-            raise InvalidCloud(f"fields {first!r} and {second!r} overlap at byte {start} of a point")
+            raise InvalidCloud(
+                f"fields {first!r} and {second!r} overlap at byte {start} of a point"
+            )
 
 
 def _as_bytes(data: Any) -> NDArray[np.uint8]:
@@ -163,7 +166,7 @@ def _decode_xyz(
     offsets = [field.offset for field in fields]
     float32 = all(field.datatype == FLOAT32 for field in fields)
     if float32 and np.diff(offsets).tolist() == [4, 4]:
-        block = np.ndarray(
+        block: NDArray[np.float32] = np.ndarray(
             xyz.shape, order + "f4", points, offset=offsets[0], strides=(*points.strides[:2], 4)
         )
         np.copyto(xyz, block)
@@ -185,9 +188,9 @@ def _decode_rgb(points: Byte, fields: dict[str, PointField], order: str) -> Byte
     packed = fields.get("rgb") or fields.get("rgba")
     if packed is not None and packed.datatype in (FLOAT32, UINT32):
         block = points[..., packed.offset : packed.offset + 4]
-        return block[..., 1:] if order == ">" else block[..., 2::-1]  # 0xAARRGGBB
+        colours: Byte = block[..., 1:] if order == ">" else block[..., 2::-1]  # 0xAARRGGBB
+        return colours
     separate = [fields.get(name) for name in ("r", "g", "b")]
     if all(field is not None and field.datatype == 2 for field in separate):
         return np.stack([points[..., f.offset] for f in separate if f is not None], axis=2)
     return None
-

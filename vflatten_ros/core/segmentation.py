@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.arrays import frozen
 from vflatten_ros.core.config import SegmentationConfig
 from vflatten_ros.core.errors import EmptyView
-from vflatten_ros.core.values import Bool, Calibration, Cloud, Float, Int, View
+from vflatten_ros.core.values import Bool, Calibration, Cloud, Int, View
 
 Points = NDArray[np.float32]
 # Half of the 26 neighbours of a voxel; the other half are their opposites.
@@ -31,7 +31,11 @@ HALF_NEIGHBOURS += [(1, j, k) for j in (-1, 0, 1) for k in (-1, 0, 1)]
 
 
 def make_view(
-    view_id: int, cloud: Cloud, calibration: Calibration, angle_rad: float, config: SegmentationConfig
+    view_id: int,
+    cloud: Cloud,
+    calibration: Calibration,
+    angle_rad: float,
+    config: SegmentationConfig,
 ) -> View:
     """The item's points of a cloud as a view at a wrist angle.
 
@@ -57,7 +61,9 @@ def view_at(
     )
 
 
-def segment(cloud: Cloud, calibration: Calibration, config: SegmentationConfig) -> NDArray[np.int32]:
+def segment(
+    cloud: Cloud, calibration: Calibration, config: SegmentationConfig
+) -> NDArray[np.int32]:
     """Pixels of the item in a cloud.
 
     Parameters
@@ -98,7 +104,8 @@ def segment(cloud: Cloud, calibration: Calibration, config: SegmentationConfig) 
     index, radius = index[kept], radius[kept]
     kept = _held(flat[index], radius, spacing, calibration, config)
     index = index[kept]
-    return np.stack([index // cols, index % cols], axis=1).astype(np.int32)
+    pixel: NDArray[np.int32] = np.stack([index // cols, index % cols], axis=1).astype(np.int32)
+    return pixel
 
 
 def _near_in_depth(flat: Points, calibration: Calibration, config: SegmentationConfig) -> Int:
@@ -177,7 +184,7 @@ def _supported(cloud: Cloud, index: Int, spacing: float, config: SegmentationCon
         far, _ = cKDTree(points).query(points, k=[config.support_points + 1])
         near: Bool = far[:, 0] < tolerance
         return near
-    rows, cols = cloud.xyz.shape[:2]
+    cols = cloud.xyz.shape[1]
     row, col = index // cols, index % cols
     step = max(1, round(0.25 * config.support_m / spacing))
     border = 2 * step
@@ -208,7 +215,11 @@ def _shifted(shape: tuple[int, int], down: int, right: int) -> tuple[slice, slic
 
 
 def _held(
-    points: Points, radius: Points, spacing: float, calibration: Calibration, config: SegmentationConfig
+    points: Points,
+    radius: Points,
+    spacing: float,
+    calibration: Calibration,
+    config: SegmentationConfig,
 ) -> Bool:
     """Points of the piece at the tip and of the pieces that belong to it."""
     if len(points) < config.min_points:

@@ -1,0 +1,444 @@
+"""The views of the present item: what the live node and the replay share, without ROS.
+
+Joint states and clouds go in as they arrive; views come out once the wrist angle at a cloud's
+stamp lies between two joint states. Every cloud becomes a view, waits, or is counted under the
+reason why it gave none: received = views + waiting + sum(drops). Not thread-safe.
+
+Stamps are the sensors' clock; `received_ns` and `now_ns` are the receiver's, for time-outs only.
+So the same messages give the same views however joint states and clouds interleave.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from vflatten_ros.core.config import Config
+from vflatten_ros.core.errors import EmptyView
+from vflatten_ros.core.fingers import FingerWatch
+from vflatten_ros.core.joints import JointReading, JointStatus, JointTrack
+from vflatten_ros.core.segmentation import segment, view_at
+from vflatten_ros.core.turntable import (
+    TURN,
+    angle_covered,
+    angle_between,
+    crowded,
+    rotation_complete,
+)
+from vflatten_ros.core.values import Calibration, Cloud, View
+
+DROP_REASONS: Mapping[str, str] = {
+    "no_joint_state": "no state of the wrist joint came in time",
+    "too_old": "the joint states nearest to the cloud's stamp are too far from it",
+    "time_went_backwards": "the cloud's stamp is not after the cloud before it",
+    "empty_after_segmentation": "no item was seen below the gripper",
+    "wrist_moving_too_fast": "the wrist turned faster than buffer.max_rate_rad_s",
+    "item_swinging": "the item had moved when it was seen again at the same angle",
+    "buffer_full": "the buffer was full, and its neighbours in angle were nearest",
+    "wrong_frame": "the cloud's frame is not the calibration's",
+    "duplicate_angle": "a better view was taken at nearly the same angle",
+    "invalid_cloud": "the message contradicts itself",
+    "gripper_open": "the fingers were open",
+    "previous_item": "the cloud was taken before the present item was held",
+    "cleared": "removed on request",
+}
+
+
+@dataclass(frozen=True)
+class ViewAdded:
+    """A cloud became a view."""
+
+    view_id: int
+    angle_rad: float
+    points: int
+
+
+@dataclass(frozen=True)
+class ViewReplaced:
+    """A better view at nearly the same angle took another's place."""
+
+    view_id: int
+    replaced_id: int
+
+
+@dataclass(frozen=True)
+class CloudDropped:
+    """A cloud gave no view, or its view was removed."""
+
+    view_id: int
+    reason: str  # a key of DROP_REASONS
+    text: str
+
+
+@dataclass(frozen=True)
+class ItemStarted:
+    """The views of the item before are gone."""
+
+    item: int
+    cause: str
+
+
+@dataclass(frozen=True)
+class RotationComplete:
+    """The views cover the whole turn."""
+
+    views: int
+    angle_covered_rad: float
+
+
+@dataclass(frozen=True)
+class ClockJumped:
+    """Stamps went back: everything before is forgotten."""
+
+    from_ns: int
+    to_ns: int
+
+
+Event = ViewAdded | ViewReplaced | CloudDropped | ItemStarted | RotationComplete | ClockJumped
+
+
+class Stage(Enum):
+    """How far the present item is; numbers as in msg/ViewBufferState."""
+
+    WAITING = 0
+    GATHERING = 1
+    COMPLETE = 2
+
+
+@dataclass(frozen=True)
+class BufferState:
+    """Summary of the buffer at one moment."""
+
+    stage: Stage
+    item: int  # from 1
+    view_ids: tuple[int, ...]
+    angle_covered_rad: float  # 0 to 2 pi
+    nbytes: int
+    clouds_received: int  # = views + clouds_waiting + sum(drops)
+    clouds_waiting: int
+    drops: Mapping[str, int]  # reason -> clouds, reasons that occurred, sorted
+    joint_states: int  # samples of the wrist joint kept
+    joints_seen: tuple[str, ...]  # names of all joints that came, sorted
+    clock_jumps: int  # since the start
+
+
+@dataclass(frozen=True, eq=False)
+class _Waiting:
+    view: View  # angle not known yet
+    received_ns: int
+
+
+class ViewBuffer:
+    """Views of the present item, gathered from clouds and joint states."""
+
+    def __init__(self, calibration: Calibration, config: Config) -> None:
+        self._calibration = calibration
+        self._config = config
+        self._track = JointTrack(config.joints)
+        self._fingers = FingerWatch(config.buffer)
+        self._joints_seen: set[str] = set()
+        self._item = 0
+        self._clock_jumps = 0
+        self._now_ns = 0
+        self._suspect: tuple[int, float] | None = None
+        self._early: list[_Waiting] = []
+        self._begin_item()
+
+    # ---- what comes in
+
+    def add_joint(
+        self, stamp_ns: int, names: Sequence[str], positions: Sequence[float], received_ns: int
+    ) -> tuple[Event, ...]:
+        """Take one joint state; states without the wrist joint count for the fingers only."""
+        if len(self._joints_seen) < 256:
+            self._joints_seen.update(names)
+        values = dict(zip(names, positions, strict=False))
+        events: list[Event] = []
+        if self._calibration.joint in values:
+            events += self._add_wrist(stamp_ns, float(values[self._calibration.joint]))
+        closed_ns = self._fingers.add(stamp_ns, values)
+        if closed_ns is not None:
+            events += self._start_item("the fingers closed", closed_ns)
+        return (*events, *self._settle(received_ns))
+
+    def add_cloud(self, cloud: Cloud, received_ns: int) -> tuple[Event, ...]:
+        """Take one decoded cloud: its item is segmented at once, its angle decided when known."""
+        if self._item_start_ns is not None and cloud.stamp_ns < self._item_start_ns:
+            self._received += 1  # takes no id, so that ids do not depend on how late it came
+            text = "taken before the present item was held"
+            return (self._drop(-1, "previous_item", text), *self._settle(received_ns))
+        view_id = self._count_cloud()
+        if cloud.frame_id != self._calibration.frame:
+            text = f"frame {cloud.frame_id!r}, the calibration is for {self._calibration.frame!r}"
+            return (self._drop(view_id, "wrong_frame", text), *self._settle(received_ns))
+        try:
+            pixel = segment(cloud, self._calibration, self._config.segmentation)
+        except EmptyView as error:
+            dropped = self._drop(view_id, "empty_after_segmentation", str(error))
+            return (dropped, *self._settle(received_ns))
+        view = view_at(view_id, cloud, pixel, self._calibration, np.nan)
+        self._waiting.append(_Waiting(view, received_ns))
+        events = list(self._settle(received_ns))
+        if len(self._waiting) > self._config.buffer.max_waiting:
+            first = self._waiting.pop(0).view
+            events.append(
+                self._drop(first.view_id, "buffer_full", "too many clouds wait for joint states")
+            )
+        return tuple(events)
+
+    def reject_cloud(self, reason: str, received_ns: int) -> tuple[Event, ...]:
+        """Count a cloud that could not be decoded."""
+        dropped = self._drop(self._count_cloud(), "invalid_cloud", reason)
+        return (dropped, *self._settle(received_ns))
+
+    def tick(self, now_ns: int) -> tuple[Event, ...]:
+        """Let time pass: clouds that have waited too long are decided or dropped."""
+        return self._settle(now_ns)
+
+    def finish(self) -> tuple[Event, ...]:
+        """No more messages will come: decide every waiting cloud with the joint states there are."""
+        return self._settle(self._now_ns, last=True)
+
+    def new_item(self, cause: str = "requested") -> tuple[Event, ...]:
+        """Forget the present item's views and counts."""
+        return tuple(self._start_item(cause, None))
+
+    def clear_views(self, view_ids: Iterable[int]) -> tuple[Event, ...]:
+        """Remove some views; unknown ids are left out."""
+        known = sorted(set(view_ids) & set(self._views))
+        return tuple(self._remove(view_id, "cleared", "removed on request") for view_id in known)
+
+    # ---- what comes out
+
+    def views(self) -> tuple[View, ...]:
+        """The views, by id."""
+        return tuple(self._views[key] for key in sorted(self._views))
+
+    def state(self) -> BufferState:
+        """Summary of the present item."""
+        stage = Stage.GATHERING if self._views else Stage.WAITING
+        return BufferState(
+            stage=Stage.COMPLETE if self._complete else stage,
+            item=self._item,
+            view_ids=tuple(sorted(self._views)),
+            angle_covered_rad=angle_covered(self._angles(), self._max_gap_rad),
+            nbytes=self._nbytes(),
+            clouds_received=self._received,
+            clouds_waiting=len(self._waiting),
+            drops=dict(sorted(self._drops.items())),
+            joint_states=len(self._track),
+            joints_seen=tuple(sorted(self._joints_seen)),
+            clock_jumps=self._clock_jumps,
+        )
+
+    # ---- the item
+
+    def _begin_item(self) -> None:
+        self._item += 1
+        self._views: dict[int, View] = {}
+        self._rates: dict[int, float] = {}
+        self._waiting: list[_Waiting] = []
+        self._drops: Counter[str] = Counter()
+        self._received = 0
+        self._next_id = 0
+        self._complete = False
+        self._newest_ns: int | None = None
+        self._first_turns: int | None = None
+        self._item_start_ns: int | None = None
+
+    def _start_item(self, cause: str, start_ns: int | None) -> list[Event]:
+        """Begin the next item; clouds taken after its start that came too early move to it."""
+        waiting = self._waiting
+        self._begin_item()
+        self._item_start_ns = start_ns
+        for entry in waiting:
+            if start_ns is not None and entry.view.stamp_ns >= start_ns:
+                view = dataclasses.replace(entry.view, view_id=self._count_cloud())
+                self._waiting.append(_Waiting(view, entry.received_ns))
+        return [ItemStarted(self._item, cause)]
+
+    def _count_cloud(self) -> int:
+        self._received += 1
+        self._next_id += 1
+        return self._next_id - 1
+
+    def _drop(self, view_id: int, reason: str, text: str) -> CloudDropped:
+        self._drops[reason] += 1
+        return CloudDropped(view_id, reason, text)
+
+    # ---- joint states
+
+    def _add_wrist(self, stamp_ns: int, position: float) -> list[Event]:
+        """One sample of the wrist; the clock was set back once two samples in a row say so."""
+        newest = self._track.newest_ns
+        jump_ns = self._config.buffer.clock_jump_s * 1e9
+        if newest is None or abs(stamp_ns - newest) <= jump_ns:
+            self._suspect = None
+            self._track.add(stamp_ns, position)
+            return []
+        suspect, self._suspect = self._suspect, (stamp_ns, position)
+        if suspect is None or not 0 < stamp_ns - suspect[0] <= jump_ns:
+            return []
+        self._suspect = None
+        events = self._jump_back(newest, suspect[0]) if suspect[0] < newest else []
+        self._track.add(*suspect)
+        self._track.add(stamp_ns, position)
+        return events
+
+    def _jump_back(self, from_ns: int, to_ns: int) -> list[Event]:
+        early = [entry for entry in self._waiting if entry.view.stamp_ns < from_ns]
+        self._track.clear()
+        self._fingers.clear()
+        self._clock_jumps += 1
+        events: list[Event] = [ClockJumped(from_ns, to_ns)]
+        self._waiting = early
+        return events + self._start_item("the clock was set back", min(to_ns, from_ns))
+
+    # ---- clouds
+
+    def _settle(self, now_ns: int, last: bool = False) -> tuple[Event, ...]:
+        """Decide every waiting cloud that can be decided, in order of arrival."""
+        self._now_ns = now_ns
+        events: list[Event] = []
+        still: list[_Waiting] = []
+        waiting, self._waiting = self._waiting, []
+        for entry in waiting:
+            over = last or now_ns - entry.received_ns >= self._config.joints.wait_s * 1e9
+            reading = self._track.at(entry.view.stamp_ns)
+            undecided = reading.status in (JointStatus.WAITING, JointStatus.NO_JOINT)
+            if not over and (undecided or self._far_back(entry.view.stamp_ns)):
+                still.append(entry)
+                continue
+            if reading.status is JointStatus.WAITING:
+                reading = self._track.held(entry.view.stamp_ns)
+            events += self._decide(entry.view, reading)
+        self._waiting = still
+        return (*events, *self._check_complete(bool(events)))
+
+    def _far_back(self, stamp_ns: int) -> bool:
+        """Whether a cloud may belong to a time after a clock jump that joint states will show."""
+        jump_ns = self._config.buffer.clock_jump_s * 1e9
+        return self._newest_ns is not None and stamp_ns < self._newest_ns - jump_ns
+
+    def _decide(self, view: View, reading: JointReading) -> list[Event]:
+        refused = self._refuse(view, reading)
+        if refused is not None:
+            return [self._drop(view.view_id, *refused)]
+        self._newest_ns = view.stamp_ns
+        placed = dataclasses.replace(view, angle_rad=self._item_angle(reading))
+        return self._store(placed, abs(reading.rate_rad_s))
+
+    def _item_angle(self, reading: JointReading) -> float:
+        """Item angle, unwrapped; the item's first view lies between -pi and pi.
+
+        So the same clouds have the same angles, to the last bit, whenever the joint states began.
+        """
+        within = self._calibration.item_angle_rad(reading.position_rad)
+        turns = round(self._calibration.joint_sign) * reading.turns
+        if self._first_turns is None:
+            self._first_turns = turns + round(within / TURN)
+        return within + (turns - self._first_turns) * TURN
+
+    def _refuse(self, view: View, reading: JointReading) -> tuple[str, str] | None:
+        """Why a cloud gives no view, whatever the other views are."""
+        stamp, limit = view.stamp_ns, self._config.buffer.max_rate_rad_s
+        joint = self._calibration.joint
+        if reading.status is JointStatus.NO_JOINT:
+            return "no_joint_state", self._no_joint_text()
+        if reading.status is not JointStatus.OK:
+            age = f"{reading.age_s:.3f} s from the cloud's stamp"
+            return "too_old", f"joint states of {joint!r} are {age}, joints.max_age_s allows less"
+        if self._newest_ns is not None and stamp <= self._newest_ns:
+            back = (self._newest_ns - stamp) * 1e-9
+            return "time_went_backwards", f"stamped {back:.3f} s before the newest view"
+        if self._fingers.open_at(stamp):
+            return "gripper_open", "taken while the fingers were open"
+        if limit and abs(reading.rate_rad_s) > limit:
+            return "wrist_moving_too_fast", f"wrist turned at {abs(reading.rate_rad_s):.2f} rad/s"
+        return None
+
+    def _no_joint_text(self) -> str:
+        seen = ", ".join(sorted(self._joints_seen)) or "none"
+        return f"no state of joint {self._calibration.joint!r} (joints seen: {seen})"
+
+    def _store(self, view: View, rate: float) -> list[Event]:
+        """Put a view in its place: beside the others, instead of one at its angle, or nowhere."""
+        rival = self._rival(view)
+        events: list[Event] = []
+        if rival is None:
+            events.append(ViewAdded(view.view_id, view.angle_rad, len(view.points_rig)))
+        else:
+            swung = self._swung(view, rival)
+            if not swung and not self._better(view, rate, rival):
+                text = f"view {rival.view_id} at the same angle is better"
+                return [self._drop(view.view_id, "duplicate_angle", text)]
+            reason = "item_swinging" if swung else "duplicate_angle"
+            text = f"view {view.view_id} took its place"
+            events += [
+                ViewReplaced(view.view_id, rival.view_id),
+                self._remove(rival.view_id, reason, text),
+            ]
+        self._views[view.view_id] = view
+        self._rates[view.view_id] = rate
+        return events + self._make_room()
+
+    def _rival(self, view: View) -> View | None:
+        """The stored view nearest in angle, if nearer than duplicate_angle_deg."""
+        limit = np.radians(self._config.buffer.duplicate_angle_deg)
+        near = [(angle_between(v.angle_rad, view.angle_rad), v.view_id) for v in self.views()]
+        distance, view_id = min(near, default=(np.inf, -1))
+        return self._views[view_id] if distance < limit else None
+
+    def _better(self, view: View, rate: float, rival: View) -> bool:
+        """A clearly slower wrist is better, else more points; the older where they are equal."""
+        difference = rate - self._rates[rival.view_id]
+        if abs(difference) > 0.05:
+            return difference < 0
+        return len(view.points_rig) > len(rival.points_rig)
+
+    def _swung(self, view: View, rival: View) -> bool:
+        limit = self._config.buffer.swing_m
+        moved = np.linalg.norm(view.points_rig.mean(axis=0) - rival.points_rig.mean(axis=0))
+        return bool(limit and moved > limit)
+
+    def _make_room(self) -> list[Event]:
+        events: list[Event] = []
+        config = self._config.buffer
+        while len(self._views) > config.max_views or self._nbytes() > config.max_megabytes * 1e6:
+            ids = sorted(self._views)
+            if len(ids) == 1:
+                break
+            view_id = ids[crowded([self._views[key].angle_rad for key in ids])]
+            events.append(self._remove(view_id, "buffer_full", DROP_REASONS["buffer_full"]))
+        return events
+
+    def _remove(self, view_id: int, reason: str, text: str) -> CloudDropped:
+        del self._views[view_id], self._rates[view_id]
+        return self._drop(view_id, reason, text)
+
+    # ---- the rotation
+
+    @property
+    def _max_gap_rad(self) -> float:
+        return float(np.radians(self._config.buffer.max_gap_deg))
+
+    def _angles(self) -> list[float]:
+        return [view.angle_rad for view in self.views()]
+
+    def _nbytes(self) -> int:
+        return sum(view.nbytes for view in self._views.values())
+
+    def _check_complete(self, changed: bool) -> list[Event]:
+        if self._complete or not changed or len(self._views) < self._config.buffer.min_views:
+            return []
+        if not rotation_complete(self._angles(), self._max_gap_rad):
+            return []
+        self._complete = True
+        return [
+            RotationComplete(len(self._views), angle_covered(self._angles(), self._max_gap_rad))
+        ]

@@ -12,6 +12,7 @@ import pytest
 from garments import example_garment, example_views
 
 from vflatten_ros import displays, messages
+from vflatten_ros.core.buffer import BufferState, Stage
 from vflatten_ros.core.errors import InvalidCorrespondence
 from vflatten_ros.core.geometry import transform_points
 
@@ -44,23 +45,28 @@ def test_every_field_of_the_message_is_given(message, fields):
 
 
 def test_buffer_state_counts_and_sorts():
-    fields = messages.view_buffer_state_fields(
-        VIEWS[::-1],
-        frame_id="rig_optical",
-        state=1,
+    state = BufferState(
+        stage=Stage.GATHERING,
         item=3,
-        selected=[5],
+        view_ids=(2, 5),
         angle_covered_rad=1.5,
-        correspondences=2,
+        nbytes=1000,
         clouds_received=9,
         clouds_waiting=1,
-        drops={"no_joint_state": 4, "empty": 2},
+        drops={"too_old": 4, "duplicate_angle": 2},
+        joint_states=7,
+        joints_seen=("wrist_roll",),
+        clock_jumps=0,
+    )
+    fields = messages.view_buffer_state_fields(
+        state, VIEWS[::-1], "rig_optical", selected=[5], correspondences=2
     )
     assert list(fields) == names_in("ViewBufferState")
     assert [view["id"] for view in fields["views"]] == [2, 5]
     assert [view["selected"] for view in fields["views"]] == [False, True]
-    assert fields["drop_reasons"] == ["empty", "no_joint_state"]
+    assert fields["drop_reasons"] == ["duplicate_angle", "too_old"]
     assert fields["drop_counts"].tolist() == [2, 4]
+    assert fields["state"] == 1
     assert messages.stamp_ns(fields["header"]["stamp"]) == VIEWS[1].stamp_ns
 
 

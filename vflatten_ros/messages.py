@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from vflatten_ros.core.buffer import BufferState
 from vflatten_ros.core.errors import InvalidCorrespondence
 from vflatten_ros.core.values import (
     Correspondence,
@@ -163,34 +164,29 @@ def view_info_fields(view: View, selected: bool) -> Fields:
 
 
 def view_buffer_state_fields(
+    state: BufferState,
     views: Sequence[View],
-    *,
     frame_id: str,
-    state: int,
-    item: int,
+    *,
     selected: Iterable[int],
-    angle_covered_rad: float,
     correspondences: int,
-    clouds_received: int,
-    clouds_waiting: int,
-    drops: Mapping[str, int],
 ) -> Fields:
-    """vflatten_ros/ViewBufferState; `state` is WAITING, GATHERING or COMPLETE."""
+    """vflatten_ros/ViewBufferState; `selected` are ids, `correspondences` the pairs stored."""
     chosen = set(selected)
     by_id = sorted(views, key=lambda view: view.view_id)
     newest = max((view.stamp_ns for view in views), default=0)
     return {
         "header": header_fields(newest, frame_id),
-        "state": int(state),
-        "item": int(item),
+        "state": int(state.stage.value),
+        "item": int(state.item),
         "views": [view_info_fields(view, view.view_id in chosen) for view in by_id],
-        "angle_covered": float(angle_covered_rad),
-        "bytes": sum(view.nbytes for view in views),
+        "angle_covered": float(state.angle_covered_rad),
+        "bytes": int(state.nbytes),
         "correspondences": int(correspondences),
-        "clouds_received": int(clouds_received),
-        "clouds_waiting": int(clouds_waiting),
-        "drop_reasons": sorted(drops),
-        "drop_counts": np.array([drops[reason] for reason in sorted(drops)], dtype=np.uint64),
+        "clouds_received": int(state.clouds_received),
+        "clouds_waiting": int(state.clouds_waiting),
+        "drop_reasons": sorted(state.drops),
+        "drop_counts": np.array([state.drops[k] for k in sorted(state.drops)], dtype=np.uint64),
     }
 
 

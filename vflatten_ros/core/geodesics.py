@@ -96,7 +96,7 @@ def _relax(surface: Surface, path: Float, progress: Progress) -> tuple[Float, Bo
         change = _newton_step(points, tangents)
         size = np.abs(change).max(axis=(1, 2))
         path[live, 1:-1] += change * np.minimum(1.0, 8.0 / np.maximum(size, 1e-12))[:, None, None]
-        np.clip(path, 0, np.array(surface.valid.shape) - 1.0, out=path)
+        np.clip(path, 0, np.array(surface.layers.valid.shape) - 1.0, out=path)
         converged[live] = size < 0.02
     return path, converged
 

@@ -6,31 +6,35 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
+from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.arrays import as_points
+from vflatten_ros.core.breaks import Layers, connected_window, find_layers
 from vflatten_ros.core.config import SurfaceConfig
 from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.raygrid import RayGrid, camera_rays, parallel_rays
+from vflatten_ros.core.smoothing import quadratic_image, slope_at, tangent_fits, value_at
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
+
+CHUNK = 2000  # places fitted at a time, so that the arrays stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Smoothed surface of one view."""
+    """Smoothed surface of one view: points as given, and fits on the grid of its rays."""
 
     points: Float  # (n, 3) input points moved along their rays onto the surface
     normals: Float  # (n, 3) unit, towards the viewer
     sigma_m: Float  # (n,) one standard deviation of points along the ray
+    layer: NDArray[np.int32]  # (n,) piece of the surface that joins without a depth jump
     raw: Float  # (n, 3) input points
     rays: RayGrid
-    depth: Float  # (rows, cols, 6) depth, its row and col slopes, and half second derivatives
-    valid: Bool  # (rows, cols)
-    layer: NDArray[np.int32]  # (rows, cols) part of the surface, 0: none
+    fits: Float  # (rows, cols, 6) quadratics of depth, see smoothing
+    layers: Layers
     sigma_grid_m: Float  # (rows, cols) standard deviation of depth along the ray
-    spacing_m: float  # typical distance of grid neighbours
-    toward: Float  # (3,) mean direction to the viewer
+    noise_m: float  # standard deviation of the input along the ray
+    spacing_m: float  # distance of grid lines across the rays
     config: SurfaceConfig
 
 
@@ -70,137 +74,145 @@ def fit_surface(
     if len(points) < 6:
         raise InvalidInput(f"points: expected at least 6 to fit a surface, got {len(points)}")
     toward = np.broadcast_to(np.asarray(toward, float), points.shape)
-    mean_toward = toward.mean(axis=0) / np.linalg.norm(toward.mean(axis=0))
-    rays, rc = _grid(points, mean_toward, pixel, shape)
+    rays, rc, organised = _place_on_grid(points, toward, pixel, shape)
+    image, seen = _depth_image(points, rays, rc, organised)
     progress("surface", 0.2)
-    depth_of_points = rays.to_grid(points)[1]
-    spacing = _spacing(points)
-    radius = config.radius_m / _cell(rays, depth_of_points)
-    cells = np.round(rc).astype(int)
-    count = np.zeros(rays.shape)
-    np.add.at(count, tuple(cells.T), 1.0)
-    total = np.zeros(rays.shape)
-    np.add.at(total, tuple(cells.T), depth_of_points)
-    seen = count > 0
-    image = np.where(seen, total / np.maximum(count, 1), 0.0)
-    coefficients, gain = _quadratic_image(image, seen, radius / 1.75)
-    progress("surface", 0.8)
-    at = coefficients[tuple(cells.T)]
-    offset = rc - cells
-    depth = _evaluate(at, offset)
-    slope = _slope(at, offset)
-    smoothed = rays.to_points(rc, depth)
-    by_row, by_col = rays.tangents(rc, depth, slope)
-    normals = np.cross(by_row, by_col)
+    cell = _cell(rays, float(np.median(image[seen])))
+    width = max(config.radius_m / 1.75 / cell, 1.2)
+    fits, gain = quadratic_image(image, seen, seen, width)
+    noise = 1.4826 * float(np.median(np.abs(image - fits[..., 0])[seen]))
+    places = np.stack(np.indices(seen.shape), axis=-1).astype(float)
+    measured = rays.to_points(places, image)
+    layers = find_layers(image, seen, measured, cell, noise)
+    progress("surface", 0.5)
+    fits, gain = quadratic_image(image, seen, layers.valid, width)
+    special = _special(layers, fits, cell, int(np.ceil(2 * width)))
+    _refit(rays, layers, measured, special, width * cell, fits, gain)
+    progress("surface", 0.9)
+    return _assemble(points, toward, rays, rc, fits, layers, noise * np.sqrt(gain), noise, cell, config)
+
+
+def _assemble(
+    points: Float, toward: Float, rays: RayGrid, rc: Float, fits: Float, layers: Layers,
+    sigma: Float, noise: float, cell: float, config: SurfaceConfig,
+) -> Surface:  # fmt: skip
+    at = tuple(np.round(rc).astype(int).T)
+    offset = rc - np.round(rc)
+    depth, slope = value_at(fits[at], offset), slope_at(fits[at], offset)
+    normals = np.cross(*rays.tangents(rc, depth, slope))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normals *= np.sign(np.einsum("ij,ij->i", normals, toward))[:, None]
-    noise = 1.4826 * np.median(np.abs(depth_of_points - depth))
-    sigma = noise * np.sqrt(gain)
+    normals *= np.where(np.einsum("ij,ij->i", normals, toward) < 0, -1.0, 1.0)[:, None]
     return Surface(
-        smoothed, normals, sigma[tuple(cells.T)], points, rays, coefficients, seen,
-        _layers(image, seen), sigma, spacing, mean_toward, config,
+        rays.to_points(rc, depth), normals, sigma[at], layers.label[at], points, rays, fits, layers,
+        sigma, noise, cell, config,
     )  # fmt: skip
 
 
-def _layers(image: Float, seen: Bool) -> NDArray[np.int32]:
-    return seen.astype(np.int32)
+def _special(layers: Layers, fits: Float, cell: float, reach: int) -> Bool:
+    """Places near a jump or steeper than 50 degrees."""
+    cut = np.zeros(layers.valid.shape, bool)
+    cut[:, :-1] |= layers.valid[:, :-1] & layers.valid[:, 1:] & ~layers.right[:, :-1]
+    cut[:-1] |= layers.valid[:-1] & layers.valid[1:] & ~layers.down[:-1]
+    steep = np.hypot(fits[..., 1], fits[..., 2]) > 1.2 * cell
+    return np.asarray(layers.valid & (maximum_filter(cut, 2 * reach + 1) | steep))
 
 
-def _spacing(points: Float) -> float:
-    tree = cKDTree(points)
-    near, _ = tree.query(points[:: max(1, len(points) // 500)], 2)
-    return float(np.median(near[:, 1]))
+def _refit(
+    rays: RayGrid, layers: Layers, measured: Float, special: Bool, width_m: float, fits: Float, gain: Float
+) -> None:
+    """Replace fits and gain at special places by fits in the local tangent frame."""
+    rows, cols = np.nonzero(special)
+    reach = 5
+    pad = np.pad(measured, ((reach, reach), (reach, reach), (0, 0)))
+    seen = np.pad(layers.seen, reach)
+    span = np.arange(2 * reach + 1)
+    for k in range(0, len(rows), CHUNK):
+        r, c = rows[k : k + CHUNK], cols[k : k + CHUNK]
+        at = (r[:, None, None] + span[None, :, None], c[:, None, None] + span[None, None, :])
+        near = connected_window(layers, r, c, reach) & seen[at]
+        window = pad[at].reshape(len(r), -1, 3)
+        source = measured.reshape(-1, 3)[layers.source[r, c]]
+        fit, variance, good = tangent_fits(
+            rays, np.stack([r, c], axis=1).astype(float), window, near.reshape(len(r), -1), source, width_m
+        )
+        fits[r[good], c[good]] = fit[good]
+        gain[r[good], c[good]] = variance[good]
 
 
-def _cell(rays: RayGrid, depth: Float) -> float:
+def _depth_image(points: Float, rays: RayGrid, rc: Float, organised: bool) -> tuple[Float, Bool]:
+    depth = rays.to_grid(points)[1]
+    image, seen = np.zeros(rays.shape), np.zeros(rays.shape, bool)
+    at = tuple(np.round(rc).astype(int).T)
+    seen[at] = True
+    if organised:
+        image[at] = depth
+        return image, seen
+    rows, cols = np.nonzero(seen)
+    places = np.stack([rows, cols], axis=1).astype(float)
+    _, near = cKDTree(rc).query(places, 9)
+    image[rows, cols] = _plane_at(places, rc[near], depth[near])
+    return image, seen
+
+
+def _plane_at(places: Float, rc: Float, depth: Float) -> Float:
+    """(k,) depth at places from the (k, n) nearest measured ones on one layer, by planes."""
+    offset = rc - places[:, None]
+    spread = np.abs(depth - depth[:, :1])
+    typical = np.median(spread)
+    weight = np.exp(-0.5 * (offset**2).sum(axis=-1)) * (spread < 6 * typical + 1e-9) + 1e-9
+    basis = np.concatenate([np.ones((*depth.shape, 1)), offset], axis=-1)
+    scaled = basis * weight[..., None]
+    normal = np.matmul(scaled.swapaxes(1, 2), basis)
+    normal += weight.sum(axis=1)[:, None, None] * np.diag([0.0, 1e-2, 1e-2])
+    right = np.einsum("kni,kn->ki", scaled, depth - depth[:, :1])
+    solved: Float = np.linalg.solve(normal, right[..., None])[:, 0, 0]
+    return solved + depth[:, 0]
+
+
+def _cell(rays: RayGrid, depth: float) -> float:
     """Metres across the rays from one grid line to the next."""
-    middle = np.array([[rays.shape[0] / 2, rays.shape[1] / 2]])
-    size = rays.e_row + np.median(depth) * rays.ray_row
-    del middle
-    return float(np.linalg.norm(size))
+    row, col = rays.e_row + depth * rays.ray_row, rays.e_col + depth * rays.ray_col
+    return float(np.sqrt(np.linalg.norm(row) * np.linalg.norm(col)))
 
 
-def _grid(
-    points: Float,
-    toward: Float,
-    pixel: NDArray[np.int32] | None,
-    shape: tuple[int, int] | None,
-) -> tuple[RayGrid, Float]:
-    """Rays and the place of every point on their grid, cropped to the points."""
+def _place_on_grid(
+    points: Float, toward: Float, pixel: NDArray[np.int32] | None, shape: tuple[int, int] | None
+) -> tuple[RayGrid, Float, bool]:
+    """Rays, the place of every point on their grid, and whether the points are at grid places."""
     rays = None
-    if pixel is not None and shape is not None and np.ptp(pixel[:, 0]) > 0:
+    if pixel is not None and shape is not None and np.ptp(pixel, axis=0).min() > 0:
         rays = camera_rays(points, pixel, shape)
+    organised = rays is not None
     if rays is None:
-        side = np.eye(3)[np.argmin(np.abs(toward))]
-        e_row = np.cross(toward, side)
-        e_row /= np.linalg.norm(e_row)
-        e_col = np.cross(toward, e_row)
-        flat = np.stack([points @ e_row, points @ e_col], axis=1)
-        near, _ = cKDTree(flat).query(flat[:: max(1, len(flat) // 2000)], 2)
-        step = max(float(np.median(near[:, 1])) * 1.5, 1e-6)
-        rays = parallel_rays(np.zeros(3), e_row * step, e_col * step, (1, 1))
+        rays = _own_grid(points, toward)
     place = rays.to_grid(points)[0]
+    if organised:
+        place = np.round(place)
     low = np.floor(place.min(axis=0)) - 4
     extent = np.ceil(place.max(axis=0)) - low + 5
-    return rays.moved(low, (int(extent[0]), int(extent[1]))), place - low
+    return rays.moved(low, (int(extent[0]), int(extent[1]))), place - low, organised
 
 
-def _quadratic_image(image: Float, seen: Bool, width: float) -> tuple[Float, Float]:
-    """Weighted quadratic at every pixel; (rows, cols, 6) and the variance gain (rows, cols)."""
-    reach = int(np.ceil(2.5 * width))
-    t = np.arange(-reach, reach + 1) / width
-    weight = np.exp(-t * t / 2)
-
-    def moment(values: Float, a: int, b: int) -> Float:
-        by_row = correlate1d(values, weight * t**a, axis=0, mode="constant")
-        out: Float = correlate1d(by_row, weight * t**b, axis=1, mode="constant")
-        return out
-
-    powers = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
-    mass = seen.astype(float)
-    moments = {q: moment(mass, *q)[seen] for q in {(a + c, b + d) for a, b in powers for c, d in powers}}
-    level = image[seen].mean()
-    lifted = np.where(seen, image - level, 0.0)
-    right = np.stack([moment(lifted, a, b)[seen] for a, b in powers], axis=-1)
-    normal = np.stack(
-        [np.stack([moments[a + c, b + d] for c, d in powers], axis=-1) for a, b in powers], axis=-2
-    )
-    ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
-    inverse = np.linalg.inv(normal + ridge)
-    solved = np.einsum("nij,nj->ni", inverse, right)
-    solved /= np.array([1, width, width, width**2, width**2, width**2])
-    solved[:, 0] += level
-    out = np.zeros((*seen.shape, 6))
-    out[seen] = solved
-    gain = np.zeros(seen.shape)
-    gain[seen] = inverse[:, 0, 0]
-    return out, gain
-
-
-def _evaluate(c: Float, d: Float) -> Float:
-    r, s = d[..., 0], d[..., 1]
-    out: Float = (
-        c[..., 0] + c[..., 1] * r + c[..., 2] * s
-        + c[..., 3] * r * r + c[..., 4] * r * s + c[..., 5] * s * s
-    )  # fmt: skip
-    return out
-
-
-def _slope(c: Float, d: Float) -> Float:
-    r, s = d[..., 0], d[..., 1]
-    return np.stack(
-        [
-            c[..., 1] + 2 * c[..., 3] * r + c[..., 4] * s,
-            c[..., 2] + c[..., 4] * r + 2 * c[..., 5] * s,
-        ],
-        axis=-1,
-    )
+def _own_grid(points: Float, toward: Float) -> RayGrid:
+    """Parallel rays about as far apart as the points."""
+    view = toward.mean(axis=0)
+    view = view / np.linalg.norm(view)
+    e_row = np.cross(view, np.eye(3)[np.argmin(np.abs(view))])
+    e_row /= np.linalg.norm(e_row)
+    e_col = np.cross(view, e_row)
+    flat = np.stack([points @ e_row, points @ e_col], axis=1)
+    near, _ = cKDTree(flat).query(flat[:: max(1, len(flat) // 2000)], 5)
+    coarse = max(2.0 * float(np.median(near[:, 4])), 1e-6)
+    area = len(np.unique(np.floor(flat / coarse), axis=0)) * coarse**2
+    step = np.sqrt(area / len(points))
+    return parallel_rays(np.zeros(3), e_row * step, e_col * step, (1, 1))
 
 
 def depth_at(surface: Surface, rc: Float) -> tuple[Float, Float, Bool]:
     """Depth and slope of the surface between grid places, and whether it is observed there.
 
-    The quadratics of the four grid places around blend with smooth weights.
+    The quadratics of the four grid places around blend with smooth weights; places that a jump
+    separates from the nearest one do not count.
 
     Parameters
     ----------
@@ -209,39 +221,50 @@ def depth_at(surface: Surface, rc: Float) -> tuple[Float, Float, Bool]:
 
     Returns
     -------
-    depth (k,), slope (k, 2), supported (k,)
+    depth (k,), slope (k, 2), observed (k,)
     """
-    rows, cols = surface.valid.shape
+    rows, cols = surface.layers.valid.shape
     base = np.clip(np.floor(rc), 0, (rows - 2, cols - 2))
     f = np.clip(rc - base, 0.0, 1.0)
+    corner = base.astype(np.int64) @ np.array([cols, 1])
+    joined = _corners(surface.layers, corner, f > 0.5)
     smooth, rate = f * f * (3 - 2 * f), 6 * f * (1 - f)
-    index = base.astype(np.int64)
-    top = np.zeros(len(rc))
-    d_top = np.zeros((len(rc), 2))
-    mass = np.zeros(len(rc))
-    d_mass = np.zeros((len(rc), 2))
-    flat_valid = surface.valid.ravel()
-    flat_depth = surface.depth.reshape(-1, 6)
-    for i in (0, 1):
-        for j in (0, 1):
-            at: Int = (index[:, 0] + i) * cols + index[:, 1] + j
-            wr = smooth[:, 0] if i else 1 - smooth[:, 0]
-            wc = smooth[:, 1] if j else 1 - smooth[:, 1]
-            ok = flat_valid[at]
-            w = wr * wc * ok
-            dw = np.stack(
-                [(rate[:, 0] if i else -rate[:, 0]) * wc, wr * (rate[:, 1] if j else -rate[:, 1])],
-                axis=1,
-            ) * ok[:, None]
-            c = flat_depth[at]
-            offset = rc - base - (i, j)
-            value, slope = _evaluate(c, offset), _slope(c, offset)
-            top += w * value
-            d_top += dw * value[:, None] + w[:, None] * slope
-            mass += w
-            d_mass += dw
-    supported = mass > 1e-6
-    safe = np.where(supported, mass, 1.0)
-    depth = top / safe
-    slope = (d_top - depth[:, None] * d_mass) / safe[:, None]
-    return depth, slope, supported
+    by_row, by_col = ((1 - smooth[:, 0], smooth[:, 0]), (1 - smooth[:, 1], smooth[:, 1]))
+    flat = surface.fits.reshape(-1, 6)
+    top, mass = np.zeros(len(rc)), np.full(len(rc), 1e-300)
+    d_top, d_mass = np.zeros((len(rc), 2)), np.zeros((len(rc), 2))
+    for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+        w = by_row[i] * by_col[j] * joined[k]
+        dw = np.stack([(2 * i - 1) * rate[:, 0] * by_col[j], (2 * j - 1) * rate[:, 1] * by_row[i]], 1)
+        dw *= joined[k][:, None]
+        fit, offset = flat[corner + i * cols + j], rc - base - (i, j)
+        value = value_at(fit, offset)
+        top += w * value
+        d_top += dw * value[:, None] + w[:, None] * slope_at(fit, offset)
+        mass += w
+        d_mass += dw
+    depth = top / mass
+    slope = (d_top - depth[:, None] * d_mass) / mass[:, None]
+    return depth, slope, mass > 1e-9
+
+
+def _corners(layers: Layers, corner: Int, far: Bool) -> Bool:
+    """(4, k) which corners of its cell are joined to the corner nearest to each place."""
+    cols = layers.valid.shape[1]
+    valid, right, down = layers.valid.ravel(), layers.right.ravel(), layers.down.ravel()
+    top, bottom = right[corner], right[corner + cols]
+    left, side = down[corner], down[corner + 1]
+    here = [valid[corner], valid[corner + 1], valid[corner + cols], valid[corner + cols + 1]]
+    across = np.where(far[:, 0], bottom, top)
+    along = np.where(far[:, 1], side, left)
+    beyond = (across & np.where(far[:, 1], left, side)) | (along & np.where(far[:, 0], top, bottom))
+    nearest = 2 * far[:, 0].astype(int) + far[:, 1]
+    out = np.zeros((4, len(corner)), bool)
+    k = np.arange(len(corner))
+    own = np.stack(here)[nearest, k]
+    out[nearest, k] = own
+    out[nearest ^ 1, k] = own & across
+    out[nearest ^ 2, k] = own & along
+    out[nearest ^ 3, k] = own & beyond
+    # nearest corner unobserved: the others carry the surface a little over its border
+    return np.where(own, out, np.stack(here))

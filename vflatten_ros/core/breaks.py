@@ -1,0 +1,137 @@
+"""Where a depth image is one piece of cloth and where it jumps from one layer to another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, uniform_filter1d
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from vflatten_ros.core.geometry import Float
+from vflatten_ros.core.values import Bool, Int
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """Which grid neighbours are one piece of cloth."""
+
+    seen: Bool  # (rows, cols) measured
+    valid: Bool  # (rows, cols) measured, or in a small hole
+    source: Int  # (rows, cols) flat index of the nearest measured place
+    right: Bool  # (rows, cols) joined to the place to the right
+    down: Bool  # (rows, cols) joined to the place below
+    label: NDArray[np.int32]  # (rows, cols) number of the piece, -1: none
+
+
+def find_layers(
+    depth: Float, seen: Bool, points: Float, cell_m: float, noise_m: float, hole: float = 2.0
+) -> Layers:
+    """Join grid neighbours that no depth jump separates.
+
+    Parameters
+    ----------
+    depth : ndarray of shape (rows, cols)
+        Depth along the rays, metres; any value where not seen.
+    seen : ndarray of shape (rows, cols)
+        Where depth was measured.
+    points : ndarray of shape (rows, cols, 3)
+        The measured points.
+    cell_m : float
+        Distance of grid lines across the rays.
+    noise_m : float
+        Standard deviation of depth.
+    hole : float
+        Places nearer than this to measured ones, in grid steps, on both sides of a hole are valid.
+    """
+    away, nearest = distance_transform_edt(~seen, return_indices=True)
+    source = nearest[0] * seen.shape[1] + nearest[1]
+    valid = away <= hole
+    # what only sticks out of the outline is not a hole: close, that is dilate and erode
+    valid &= distance_transform_edt(np.pad(valid, 1, constant_values=False))[1:-1, 1:-1] > hole
+    valid |= seen
+    joined = []
+    for axis in (1, 0):
+        join = _joined(depth, seen, points, source, axis, cell_m, noise_m)
+        beyond = np.roll(valid, -1, axis=axis)
+        join &= valid & beyond
+        join[(slice(None), -1) if axis else -1] = False
+        joined.append(join)
+    right, down = joined
+    return Layers(seen, valid, source, right, down, _label(valid, right, down))
+
+
+def _joined(
+    depth: Float, seen: Bool, points: Float, source: Int, axis: int, cell_m: float, noise_m: float
+) -> Bool:
+    """Whether each place and the next along the axis are on one surface."""
+    flat = points.reshape(-1, 3)
+    other = np.roll(source, -1, axis=axis)
+    gap = np.linalg.norm(flat[source] - flat[other], axis=-1)
+    rows, cols = np.divmod(source, seen.shape[1])
+    rows2, cols2 = np.divmod(other, seen.shape[1])
+    steps = np.maximum(np.hypot(rows - rows2, cols - cols2), 1.0)
+    # six grid steps deep for one across: 80 degrees from the view
+    near = gap < np.hypot(6.0 * cell_m * steps, 5.0 * noise_m)
+    step = _step(depth, seen, axis)
+    return np.asarray(near & ~(step > max(4.0 * noise_m, 1.2 * cell_m)))
+
+
+def _step(depth: Float, seen: Bool, axis: int) -> Float:
+    """How much the change to the next place exceeds the slopes on its two sides; nan: unknown.
+
+    On a smooth surface the change lies between the slopes before and after, whatever the
+    curvature; at a step it does not.
+    """
+    z = np.where(seen, depth, np.nan)
+    change = np.roll(z, -1, axis=axis) - z
+    change[(slice(None), -1) if axis else -1] = np.nan
+    known = np.isfinite(change)
+    mass = uniform_filter1d(known.astype(float), 3, axis=1 - axis, mode="constant")
+    total = uniform_filter1d(np.where(known, change, 0.0), 3, axis=1 - axis, mode="constant")
+    mean = np.where(known, total / np.maximum(mass, 1e-9), np.nan)
+    before = (_shift(mean, 1, axis) + _shift(mean, 2, axis)) / 2
+    after = (_shift(mean, -1, axis) + _shift(mean, -2, axis)) / 2
+    low, high = np.fmin(before, after), np.fmax(before, after)
+    return np.asarray(np.fmax(mean - high, low - mean))
+
+
+def _shift(values: Float, by: int, axis: int) -> Float:
+    out = np.roll(values, by, axis=axis)
+    edge = slice(0, by) if by > 0 else slice(by, None)
+    out[(slice(None), edge) if axis else edge] = np.nan
+    return out
+
+
+def _label(valid: Bool, right: Bool, down: Bool) -> NDArray[np.int32]:
+    number = np.arange(valid.size).reshape(valid.shape)
+    a = np.concatenate([number[right], number[down]])
+    b = np.concatenate([number[right] + 1, number[down] + valid.shape[1]])
+    graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(valid.size, valid.size))
+    _, label = connected_components(graph, directed=False)
+    order = np.full(label.max() + 1, -1)
+    used, first = np.unique(label[valid.ravel()], return_index=True)
+    order[used[np.argsort(first)]] = np.arange(len(used))
+    return np.where(valid, order[label].reshape(valid.shape), -1).astype(np.int32)
+
+
+def connected_window(layers: Layers, rows: Int, cols: Int, reach: int) -> Bool:
+    """(k, 2 reach + 1, 2 reach + 1) which places around each one are joined to it inside the window."""
+    pad = reach + 1
+    valid, right, down = (np.pad(m, pad) for m in (layers.valid, layers.right, layers.down))
+    span = np.arange(-reach, reach + 1) + pad
+    at = (rows[:, None, None] + span[None, :, None], cols[:, None, None] + span[None, None, :])
+    r, d = right[at][:, :, :-1], down[at][:, :-1, :]
+    reached = np.zeros((len(rows), len(span), len(span)), bool)
+    reached[:, reach, reach] = valid[at][:, reach, reach]
+    for _ in range(2 * reach):
+        before = int(reached.sum())
+        reached[:, :, 1:] |= reached[:, :, :-1] & r
+        reached[:, :, :-1] |= reached[:, :, 1:] & r
+        reached[:, 1:] |= reached[:, :-1] & d
+        reached[:, :-1] |= reached[:, 1:] & d
+        if int(reached.sum()) == before:
+            break
+    return reached

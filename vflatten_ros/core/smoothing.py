@@ -1,0 +1,194 @@
+"""Local quadratic fits of a noisy depth image.
+
+A fit is six numbers at a grid place: depth, its slopes by row and column, and the terms of
+row**2, row * col and col**2, in grid steps from the place.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import correlate1d
+
+from vflatten_ros.core.geometry import Float
+from vflatten_ros.core.raygrid import RayGrid
+from vflatten_ros.core.values import Bool
+
+POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+
+
+def value_at(fit: Float, offset: Float) -> Float:
+    """Depth of (..., 6) fits at (..., 2) grid steps from their places."""
+    r, c = offset[..., 0], offset[..., 1]
+    out: Float = (
+        fit[..., 0] + fit[..., 1] * r + fit[..., 2] * c
+        + fit[..., 3] * r * r + fit[..., 4] * r * c + fit[..., 5] * c * c
+    )  # fmt: skip
+    return out
+
+
+def slope_at(fit: Float, offset: Float) -> Float:
+    """(..., 2) change of depth a row and a column."""
+    r, c = offset[..., 0], offset[..., 1]
+    by_row = fit[..., 1] + 2 * fit[..., 3] * r + fit[..., 4] * c
+    by_col = fit[..., 2] + fit[..., 4] * r + 2 * fit[..., 5] * c
+    return np.stack([by_row, by_col], axis=-1)
+
+
+def quadratic_image(depth: Float, seen: Bool, where: Bool, width: float) -> tuple[Float, Float]:
+    """Gaussian-weighted quadratic of the depth image by separable sums.
+
+    Parameters
+    ----------
+    depth : ndarray of shape (rows, cols)
+        Depth, any value where not seen.
+    seen, where : ndarray of shape (rows, cols)
+        Measured places, and places that want a fit.
+    width : float
+        Standard deviation of the weight in grid steps.
+
+    Returns
+    -------
+    fits : ndarray of shape (rows, cols, 6)
+        Zero outside `where`.
+    gain : ndarray of shape (rows, cols)
+        Variance of the fitted depth over that of a measured one.
+    """
+    reach = int(np.ceil(2.5 * width))
+    t = np.arange(-reach, reach + 1) / width
+    kernels = [np.exp(-t * t / 2) * t**a for a in range(5)]
+    level = float(depth[seen].mean())
+    mass = _moments(seen.astype(float), kernels, 4)
+    lifted = _moments(np.where(seen, depth - level, 0.0), kernels, 2)
+    pick = np.nonzero(where)
+    normal = np.empty((len(pick[0]), 6, 6))
+    right = np.empty((len(pick[0]), 6))
+    for i, (a, b) in enumerate(POWERS):
+        right[:, i] = lifted[a, b][pick]
+        for j, (c, d) in enumerate(POWERS[: i + 1]):
+            normal[:, i, j] = normal[:, j, i] = mass[a + c, b + d][pick]
+    solved, variance = _solve(normal, right)
+    solved /= width ** np.array([0, 1, 1, 2, 2, 2])
+    solved[:, 0] += level
+    fits, gain = np.zeros((*seen.shape, 6)), np.zeros(seen.shape)
+    fits[pick], gain[pick] = solved, variance
+    return fits, gain
+
+
+def _moments(values: Float, kernels: list[Float], order: int) -> dict[tuple[int, int], Float]:
+    out = {}
+    for a in range(order + 1):
+        along = correlate1d(values, kernels[a], axis=0, mode="constant")
+        for b in range(order + 1 - a):
+            out[a, b] = correlate1d(along, kernels[b], axis=1, mode="constant")
+    return out
+
+
+def _solve(normal: Float, right: Float) -> tuple[Float, Float]:
+    """Solutions of small systems, held back where the data do not settle curvature."""
+    total = normal[:, 0, 0]
+    hold = np.array([1e-9, 1e-6, 1e-6, 3e-3, 3e-3, 3e-3])
+    normal = normal + (total[:, None] * hold)[:, :, None] * np.eye(6)
+    both = np.zeros((len(right), 6, 2))
+    both[:, :, 0] = right
+    both[:, 0, 1] = 1.0
+    solved = np.linalg.solve(normal, both)
+    return solved[:, :, 0], solved[:, 0, 1]
+
+
+def tangent_fits(
+    rays: RayGrid, rc: Float, points: Float, near: Bool, middle: Float, width_m: float
+) -> tuple[Float, Float, Bool]:
+    """Quadratics in the local tangent frame, for steep places and beside jumps.
+
+    Parameters
+    ----------
+    rays : RayGrid
+    rc : ndarray of shape (k, 2)
+        Grid places of the fits.
+    points : ndarray of shape (k, n, 3)
+        Measured points around each place.
+    near : ndarray of shape (k, n)
+        Which of them count.
+    middle : ndarray of shape (k, 3)
+        Measured point nearest to each place.
+    width_m : float
+        Standard deviation of the weight along the surface, metres.
+
+    Returns
+    -------
+    fits (k, 6), gain (k,), good (k,)
+    """
+    mass = near.astype(float)
+    away = points - middle[:, None]
+    weight = mass * np.exp(-0.5 * (away**2).sum(axis=-1) / (1.5 * width_m) ** 2)
+    weight += 1e-6 * mass + 1e-12
+    axes = _principal_axes(away, weight)
+    local = np.einsum("kij,knj->kni", axes, away) / width_m
+    u, v, w = local[..., 0], local[..., 1], local[..., 2]
+    weight = mass * np.exp(-0.5 * (u * u + v * v)) + 1e-9 * mass + 1e-12
+    basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    scaled = basis * weight[..., None]
+    normal = np.matmul(scaled.swapaxes(1, 2), basis)
+    right = np.einsum("kni,kn->ki", scaled, w)
+    surface, gain = _solve(normal, right)
+    return _to_rays(rays, rc, middle, axes, surface, width_m, gain)
+
+
+def _principal_axes(away: Float, weight: Float) -> Float:
+    """(k, 3, 3) rows: two tangents and the normal."""
+    total = weight.sum(axis=1)
+    mean = np.einsum("kn,kni->ki", weight, away) / total[:, None]
+    d = away - mean[:, None]
+    spread = np.matmul((d * weight[..., None]).swapaxes(1, 2), d)
+    _, vectors = np.linalg.eigh(spread / np.trace(spread, axis1=1, axis2=2)[:, None, None])
+    return np.asarray(vectors[:, :, ::-1].swapaxes(1, 2))
+
+
+def _to_rays(
+    rays: RayGrid, rc: Float, centre: Float, axes: Float, surface: Float, width_m: float, gain: Float
+) -> tuple[Float, Float, Bool]:
+    """Fits as depth along the rays, by implicit differentiation of w - f(u, v) = 0."""
+    depth = rays.to_grid(centre)[1]
+    good = np.ones(len(rc), bool)
+    for _ in range(6):
+        gradient, _, value = _implicit(rays, rc, depth, centre, axes, surface, width_m)
+        slope = gradient[:, 2]
+        steep = np.abs(slope) * width_m < 0.1 * np.linalg.norm(rays.rays(rc), axis=1)
+        step = np.where(steep, 0.0, -value / np.where(steep, 1.0, slope))
+        depth = depth + np.clip(step, -2 * width_m, 2 * width_m)
+        good &= ~steep
+    good &= np.abs(step) < 0.05 * width_m
+    gradient, hessian, _ = _implicit(rays, rc, depth, centre, axes, surface, width_m)
+    by = gradient[:, 2]
+    by = np.where(good, by, 1.0)
+    g_r, g_c = -gradient[:, 0] / by, -gradient[:, 1] / by
+    along_r = np.stack([np.ones_like(g_r), np.zeros_like(g_r), g_r], axis=1)
+    along_c = np.stack([np.zeros_like(g_c), np.ones_like(g_c), g_c], axis=1)
+    second = [
+        -np.einsum("ki,kij,kj->k", a, hessian, b) / by
+        for a, b in ((along_r, along_r), (along_r, along_c), (along_c, along_c))
+    ]
+    fits = np.stack([depth, g_r, g_c, second[0] / 2, second[1], second[2] / 2], axis=1)
+    return fits, gain, good
+
+
+def _implicit(
+    rays: RayGrid, rc: Float, depth: Float, centre: Float, axes: Float, surface: Float, width_m: float
+) -> tuple[Float, Float, Float]:
+    """Gradient (k, 3) and Hessian (k, 3, 3) of w - f(u, v) by (row, col, depth), its value."""
+    ray = rays.rays(rc)
+    p = np.einsum("kij,kj->ki", axes, rays.to_points(rc, depth) - centre) / width_m
+    d_row = rays.e_row + depth[:, None] * rays.ray_row
+    d_col = rays.e_col + depth[:, None] * rays.ray_col
+    motion = np.stack([d_row, d_col, ray], axis=2)  # (k, 3, 3) columns: point by row, col, depth
+    local = np.matmul(axes, motion) / width_m
+    u, v = p[:, 0], p[:, 1]
+    f_u = surface[:, 1] + 2 * surface[:, 3] * u + surface[:, 4] * v
+    f_v = surface[:, 2] + surface[:, 4] * u + 2 * surface[:, 5] * v
+    f = surface[:, 0] + 0.5 * ((surface[:, 1] + f_u) * u + (surface[:, 2] + f_v) * v)
+    gradient = local[:, 2] - f_u[:, None] * local[:, 0] - f_v[:, None] * local[:, 1]
+    bend = np.zeros((len(rc), 3, 3))
+    bend[:, 0, 0], bend[:, 1, 1] = -2 * surface[:, 3], -2 * surface[:, 5]
+    bend[:, 0, 1] = bend[:, 1, 0] = -surface[:, 4]
+    hessian = np.matmul(local.swapaxes(1, 2), np.matmul(bend, local))
+    return gradient, hessian, p[:, 2] - f

@@ -43,7 +43,8 @@ PY
 venv_key() {
   "$python" -c 'import sys; print(sys.version, sys.base_prefix)'
   echo "$root" "$underlay"
-  cat "$lock" scripts/fix_ros_wheels.py
+  grep -v '^ *#' "$lock"
+  cat scripts/fix_ros_wheels.py
 }
 
 install_locked() {
@@ -111,11 +112,13 @@ build_package() {
   ( set +u; eval "$(underlay_lines)"; set -u
     command -v colcon >/dev/null || die "missing colcon; try: apt-get install python3-colcon-common-extensions"
     say "building the interfaces; half a minute the first time"
-    rm -rf install
+    # Without it colcon waits for the machine's other work to end.
+    export MAKEFLAGS=-j$(nproc)
     colcon --log-base build/log build --base-paths . --symlink-install \
       --cmake-args -DPython3_EXECUTABLE="$venv/bin/python3" -DBUILD_TESTING=OFF \
       > build/bootstrap.log 2>&1 ||
       { cat build/bootstrap.log >&2; die "the build failed; its log is build/bootstrap.log"; } )
+  find install -xtype l -delete  # links to files that are gone
   echo "$key" > install/bootstrap.key
 }
 

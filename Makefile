@@ -1,0 +1,72 @@
+# Every target prepares what it needs; `make help` lists them.
+SHELL := bash
+.SHELLFLAGS := -eo pipefail -c
+.DEFAULT_GOAL := help
+
+BAG ?= bags/LS1_1
+PROTOCOL ?= $(wildcard $(BAG)/protocol.json)
+PYTHON ?= python3
+
+# Runs what follows in the built package's environment.
+IN_ENV := source env.sh;
+
+.PHONY: help bootstrap demo test check format bench bench-peers reproduce docs lock clean
+
+help:  ## This list
+	@sed -nE 's/^([a-z-]+):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
+
+bootstrap:  ## Build the package; afterwards: source env.sh
+	@scripts/bootstrap.sh
+
+demo: bootstrap  ## Flatten a recorded garment: a table, and figures in build/demo (BAG=bags/TR1_1)
+	@$(IN_ENV) vflatten replay $(BAG) $(if $(PROTOCOL),--protocol $(PROTOCOL)) \
+	  --json build/demo/result.json --figures build/demo
+
+test: bootstrap  ## All tests, on the built package (TESTS="test/core -k plane" for some)
+	@$(IN_ENV) VFLATTEN_REQUIRE_ROS=1 pytest $(TESTS)
+
+check: bootstrap  ## Lint and types
+	@$(IN_ENV) ruff check
+	@$(IN_ENV) ruff format --check
+	@$(IN_ENV) env -u PYTHONPATH mypy
+
+format: bootstrap  ## Rewrite the code the way `make check` wants it
+	@$(IN_ENV) ruff check --fix --exit-zero; ruff format
+
+bench: bootstrap  ## Time our stages (ARGS="--save a.json" or "--compare a.json b.json")
+	@$(IN_ENV) python benchmarks/bench.py $(ARGS)
+
+bench-peers: build/peers/ready  ## Against other libraries: docs/benchmarks.md (QUICK=1: under a minute)
+	@PYTHONPATH=. build/peers/bin/python benchmarks/bench_peers.py $(if $(QUICK),--quick) $(ARGS)
+
+reproduce: bootstrap  ## The paper's experiments: docs/reproduction.md
+	@$(IN_ENV) python -m vflatten_ros.reproduce $(ARGS)
+
+docs: bootstrap  ## Regenerate docs/parameters.md from the defaults in the code
+	@$(IN_ENV) python scripts/write_parameters.py > build/parameters.md; mv build/parameters.md docs/parameters.md
+
+# Keeps the pins that still fit; UPGRADE=1 moves to the newest versions.
+COMPILE := ../build/uv/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
+  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
+lock:  ## Pin all requirements anew, transitive ones and hashes included
+	@$(PYTHON) -m venv build/uv
+	@build/uv/bin/pip install --quiet --disable-pip-version-check uv==0.13.9
+	@cd requirements; $(COMPILE) runtime.in dev.in ros.in --output-file wheels.txt
+	@cd requirements; $(COMPILE) beside-ros.in --constraint wheels.txt --no-emit-package numpy --output-file beside-ros.txt
+	@cd requirements; $(COMPILE) peers.in --constraint wheels.txt --output-file peers.txt
+
+clean:  ## Remove everything that was built
+	@rm -rf .venv build install log env.sh *.egg-info .mypy_cache .ruff_cache .pytest_cache
+
+# The peers are compared without ROS, in an environment of their own.
+build/peers/ready: requirements/peers.txt
+	@rm -rf build/peers
+	@$(PYTHON) -m venv build/peers
+	@build/peers/bin/pip install --quiet --disable-pip-version-check --require-hashes --no-deps -r $<
+	@touch $@
+
+ifneq ($(wildcard benchmarks/accuracy.py),)
+.PHONY: accuracy
+accuracy: bootstrap  ## Errors over many recordings: docs/accuracy.md (RECORDINGS="DIR ...")
+	@$(IN_ENV) python benchmarks/accuracy.py $(RECORDINGS) $(ARGS)
+endif

@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, uniform_filter1d
+from scipy.ndimage import label as connected_regions
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from vflatten_ros.core.geometry import Float
 from vflatten_ros.core.values import Bool, Int
+
+RING = 2.0  # grid steps that the surface is carried beyond measured places
+HOLE = 20  # places in a hole that neighbours fill: single measurements that failed
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +23,7 @@ class Layers:
     """Which grid neighbours are one piece of cloth."""
 
     seen: Bool  # (rows, cols) measured
-    valid: Bool  # (rows, cols) measured, or in a small hole
+    valid: Bool  # (rows, cols) measured, in a small hole, or within RING of the border
     source: Int  # (rows, cols) flat index of the nearest measured place
     right: Bool  # (rows, cols) joined to the place to the right
     down: Bool  # (rows, cols) joined to the place below
@@ -27,7 +31,7 @@ class Layers:
 
 
 def find_layers(
-    depth: Float, seen: Bool, points: Float, cell_m: float, noise_m: float, hole: float = 2.0
+    depth: Float, seen: Bool, points: Float, cell_m: float, noise_m: float
 ) -> Layers:
     """Join grid neighbours that no depth jump separates.
 
@@ -43,20 +47,18 @@ def find_layers(
         Distance of grid lines across the rays.
     noise_m : float
         Standard deviation of depth.
-    hole : float
-        Places nearer than this to measured ones, in grid steps, on both sides of a hole are valid.
     """
     away, nearest = distance_transform_edt(~seen, return_indices=True)
     source = nearest[0] * seen.shape[1] + nearest[1]
-    valid = away <= hole
-    # what only sticks out of the outline is not a hole: close, that is dilate and erode
-    valid &= distance_transform_edt(np.pad(valid, 1, constant_values=False))[1:-1, 1:-1] > hole
-    valid |= seen
+    holes, _ = connected_regions(~seen)
+    small = np.bincount(holes.ravel())[holes] <= HOLE
+    small &= ~seen
+    valid = (away <= RING) | small
+    across = np.where(small, 8.0, 3.0)
     joined = []
     for axis in (1, 0):
-        join = _joined(depth, seen, points, source, axis, cell_m, noise_m)
-        beyond = np.roll(valid, -1, axis=axis)
-        join &= valid & beyond
+        join = _joined(depth, seen, points, source, across, axis, cell_m, noise_m)
+        join &= valid & np.roll(valid, -1, axis=axis)
         join[(slice(None), -1) if axis else -1] = False
         joined.append(join)
     right, down = joined
@@ -64,8 +66,9 @@ def find_layers(
 
 
 def _joined(
-    depth: Float, seen: Bool, points: Float, source: Int, axis: int, cell_m: float, noise_m: float
-) -> Bool:
+    depth: Float, seen: Bool, points: Float, source: Int, across: Float, axis: int,
+    cell_m: float, noise_m: float,
+) -> Bool:  # fmt: skip
     """Whether each place and the next along the axis are on one surface."""
     flat = points.reshape(-1, 3)
     other = np.roll(source, -1, axis=axis)
@@ -73,24 +76,29 @@ def _joined(
     rows, cols = np.divmod(source, seen.shape[1])
     rows2, cols2 = np.divmod(other, seen.shape[1])
     steps = np.maximum(np.hypot(rows - rows2, cols - cols2), 1.0)
-    # six grid steps deep for one across: 80 degrees from the view
-    near = gap < np.hypot(6.0 * cell_m * steps, 5.0 * noise_m)
-    step = _step(depth, seen, axis)
-    return np.asarray(near & ~(step > max(4.0 * noise_m, 1.2 * cell_m)))
+    # six grid steps deep for one across is 80 degrees from the view
+    both = seen & np.roll(seen, -1, axis=axis)
+    # steeper places cannot be told from a jump where nothing was measured between
+    near = gap < np.hypot(np.where(both, 6.0, 2.5) * cell_m * steps, 5.0 * noise_m)
+    near &= steps <= np.maximum(across, np.roll(across, -1, axis=axis))
+    limit = max(4.0 * noise_m, 1.2 * cell_m)
+    # a jump is a line of places, noise is not
+    step = (_step(depth, seen, axis, 3) > limit) & (_step(depth, seen, axis, 7) > limit / 2)
+    return np.asarray(near & ~step)
 
 
-def _step(depth: Float, seen: Bool, axis: int) -> Float:
+def _step(depth: Float, seen: Bool, axis: int, across: int) -> Float:
     """How much the change to the next place exceeds the slopes on its two sides; nan: unknown.
 
     On a smooth surface the change lies between the slopes before and after, whatever the
-    curvature; at a step it does not.
+    curvature; at a step it does not. Changes are means over `across` places beside each other.
     """
     z = np.where(seen, depth, np.nan)
     change = np.roll(z, -1, axis=axis) - z
     change[(slice(None), -1) if axis else -1] = np.nan
     known = np.isfinite(change)
-    mass = uniform_filter1d(known.astype(float), 3, axis=1 - axis, mode="constant")
-    total = uniform_filter1d(np.where(known, change, 0.0), 3, axis=1 - axis, mode="constant")
+    mass = uniform_filter1d(known.astype(float), across, axis=1 - axis, mode="constant")
+    total = uniform_filter1d(np.where(known, change, 0.0), across, axis=1 - axis, mode="constant")
     mean = np.where(known, total / np.maximum(mass, 1e-9), np.nan)
     before = (_shift(mean, 1, axis) + _shift(mean, 2, axis)) / 2
     after = (_shift(mean, -1, axis) + _shift(mean, -2, axis)) / 2
@@ -135,3 +143,26 @@ def connected_window(layers: Layers, rows: Int, cols: Int, reach: int) -> Bool:
         if int(reached.sum()) == before:
             break
     return reached
+
+
+def joined_places(layers: Layers, rc: Float) -> tuple[Bool, Bool]:
+    """Whether (m, n, 2) grid places are on observed surface, and consecutive ones on one piece.
+
+    Returns
+    -------
+    observed (m, n), joined (m, n - 1)
+    """
+    rows, cols = layers.valid.shape
+    place = np.clip(np.round(rc).astype(np.int64), 0, (rows - 1, cols - 1))
+    observed = layers.valid[place[..., 0], place[..., 1]]
+    r0, c0 = place[:, :-1, 0], place[:, :-1, 1]
+    r1, c1 = place[:, 1:, 0], place[:, 1:, 1]
+    left, top = np.minimum(c0, c1), np.minimum(r0, r1)
+    across, along = c0 != c1, r0 != r1
+    by_col0 = ~across | layers.right[r0, left]  # first along the row of the start
+    by_col1 = ~across | layers.right[r1, left]
+    by_row0 = ~along | layers.down[top, c0]
+    by_row1 = ~along | layers.down[top, c1]
+    step = (np.abs(c1 - c0) <= 1) & (np.abs(r1 - r0) <= 1)
+    joined = step & ((by_col0 & by_row1) | (by_row0 & by_col1))
+    return observed, joined & observed[:, :-1] & observed[:, 1:]

@@ -80,12 +80,13 @@ class SegmentationConfig(Checked):
     tip_clearance_m: float = option(
         0.008, "Points less than this below the gripper tip are the gripper's, m.", low=-0.1, high=0.5
     )
-    hold_m: float = option(
-        0.15, "The item begins within this distance of the gripper tip, m.", low=0.01, high=1.0
-    )
     link_m: float = option(0.015, "Points nearer than this are one piece, m.", low=0.003, high=0.1)
     gap_m: float = option(
-        0.15, "A piece belongs to the item if no wider gap parts them, m.", low=0.0, high=1.0
+        0.15,
+        "A piece belongs to the item if no wider gap parts it from the rest or the tip, m; "
+        "three times as wide along the axis.",
+        low=0.0,
+        high=1.0,
     )
     piece_area_m2: float = option(
         0.0001, "Pieces that show less than this area are noise, m2.", low=0.0, high=0.1
@@ -94,7 +95,7 @@ class SegmentationConfig(Checked):
         0.01, "Neighbours within this depth support a point, m.", low=0.001, high=0.1
     )
     support_points: int = option(
-        3, "A point with fewer neighbours at its depth is a flying pixel.", low=0, high=12
+        2, "A point with fewer neighbours at its depth is a flying pixel.", low=0, high=20
     )
     wall_m: float = option(
         0.015, "Half the thickness taken for a wall or table, m.", low=0.001, high=0.1
@@ -181,6 +182,9 @@ class PatchConfig(Checked):
     jump_m: float = option(
         0.03, "Change of depth to the next pixel that is a step on any slope, m.", low=0.001, high=1.0
     )
+    margin_px: int = option(
+        1, "Patches do not join through what is this near to a line of steps, pixels.", low=0, high=20
+    )
     min_points: int = option(40, "Patches of fewer pixels are left out.", low=3, high=100000)
 
 
@@ -188,7 +192,12 @@ class PatchConfig(Checked):
 class GeodesicConfig(Checked):
     """Shortest lines along the surface (paper, section 2.1)."""
 
-    nodes: int = option(30, "Nodes M of a line.", low=3, high=500)
+    solver: str = option(
+        "newton",
+        "'springs': the paper's on its linear fit; 'newton': Gauss-Newton on the fitted surface.",
+        choices=("newton", "springs"),
+    )
+    nodes: int = option(50, "Nodes M of a line.", low=3, high=500)
     height_window_m: float = option(
         0.05, "Pairs of boundary points nearer in height than this get a line, m.", low=0.0, high=2.0
     )
@@ -278,12 +287,15 @@ class RotationConfig(Checked):
     )
     link_m: float = option(0.0088, "Longest link between samples, m.", low=0.002, high=0.1)
     step_m: float = option(
-        0.0008, "Largest step between linked samples, along their normal, m.", low=1e-5, high=0.02
+        0.00055, "Largest step between linked samples, along their normal, m.", low=1e-5, high=0.02
     )
     overlap: float = option(
         0.3, "Least share of neighbours that linked samples have in common.", low=0.0, high=1.0
     )
     rim_m: float = option(0.007, "Longest link round a sharp rim, m.", low=0.001, high=0.05)
+    valley_m: float = option(
+        0.001, "Deepest groove that a link round a rim may cross, m.", low=0.0, high=0.02
+    )
     landmarks: int = option(
         400, "Samples whose mutual distances are unfolded.", low=50, high=5000
     )

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
-from scipy.spatial import cKDTree
 
 from vflatten_ros.core.arrays import as_points
+from vflatten_ros.core.breaks import joined_places
 from vflatten_ros.core.config import GeodesicConfig
 from vflatten_ros.core.errors import InvalidInput
+from vflatten_ros.core.routes import find_routes
+from vflatten_ros.core.springs import relax_springs
 from vflatten_ros.core.surface import Surface, depth_at
 from vflatten_ros.core.values import Bool, Float, Progress, no_progress
 
-OK, JUMP, MISSING, BENT, NOT_CONVERGED = 0, 1, 2, 3, 4
+OK, JUMP, MISSING, BENT, NOT_CONVERGED = range(5)
+REASONS = ("ok", "jump", "missing data", "bent", "not converged")
+STEPS = 20  # of Gauss-Newton; lines on cloth need 3 to 8
+FINE = 4  # samples a node interval when a line is measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +43,10 @@ def geodesic_lines(
 ) -> Geodesics:
     """Shortest lines on the surface between pairs of points.
 
+    A line that nothing observed joins crosses the gap on an extrapolated surface, with reason
+    JUMP or MISSING and a standard deviation that grows with the gap. A line that bends round a
+    border is BENT: its length is an upper bound of the distance on the flat cloth.
+
     Parameters
     ----------
     surface : Surface
@@ -57,60 +66,124 @@ def geodesic_lines(
     starts, ends = as_points(starts, "starts"), as_points(ends, "ends")
     if len(starts) != len(ends):
         raise InvalidInput(f"starts and ends differ in number: {len(starts)} and {len(ends)}")
-    a, b = _on_grid(surface, starts), _on_grid(surface, ends)
-    t = np.linspace(0, 1, config.nodes)[None, :, None]
+    if not len(starts):
+        none = np.zeros(0)
+        return Geodesics(np.zeros((0, config.nodes, 3)), none, none, none > 0, none.astype(np.uint8))
+    a, b = surface.rays.to_grid(starts)[0], surface.rays.to_grid(ends)[0]
+    path, apart = _first_guess(surface, a, b, config.nodes)
+    progress("geodesics", 0.3)
+    if config.solver == "springs":
+        nodes, held, converged = relax_springs(surface, path, progress)
+        lines = _describe(surface, surface.rays.to_grid(nodes)[0], held, converged, apart)
+        length = np.linalg.norm(np.diff(nodes, axis=1), axis=2).sum(axis=1)
+        return replace(lines, nodes=nodes, length_m=length)
+    path, held, converged = relax_newton(surface, path, progress)
+    return _describe(surface, path, held, converged, apart)
+
+
+def _first_guess(surface: Surface, a: Float, b: Float, nodes: int) -> tuple[Float, Bool]:
+    """(m, nodes, 2) lines on the observed surface where there are any, and which ends are apart."""
+    t = np.linspace(0, 1, nodes)[None, :, None]
     path = a[:, None] + t * (b - a)[:, None]
-    path, converged = _relax(surface, path, progress)
-    nodes, length, supported = _measure(surface, path)
-    reason = np.where(~supported, MISSING, np.where(converged, OK, NOT_CONVERGED)).astype(np.uint8)
-    near = cKDTree(surface.raw)
-    sigma_end = surface.sigma_m[near.query(starts)[1]] ** 2 + surface.sigma_m[near.query(ends)[1]] ** 2
-    sigma = np.sqrt(sigma_end + (0.001 * length) ** 2 + np.where(reason > 0, 0.05 * length, 0) ** 2)
-    return Geodesics(nodes, length, sigma, reason > 0, reason)
+    lost = ~_open(surface, path)
+    apart = np.zeros(len(a), bool)
+    if lost.any():
+        points = _grid_points(surface)
+        way, length = find_routes(surface.layers, points, a[lost], b[lost], nodes, bridge=False)
+        path[lost] = way
+        apart[lost] = np.isinf(length)
+    return path, apart
 
 
-def _on_grid(surface: Surface, points: Float) -> Float:
-    return surface.rays.to_grid(points)[0]
+def _grid_points(surface: Surface) -> Float:
+    places = np.stack(np.indices(surface.layers.valid.shape), axis=-1).astype(float)
+    return surface.rays.to_points(places, surface.fits[..., 0])
 
 
-def _points(surface: Surface, rc: Float) -> tuple[Float, Float, Bool]:
-    """(m, M, 3) points, (m, M, 3, 2) tangents and (m, M) support at (m, M, 2) grid places."""
+def _dense(path: Float, fine: int) -> Float:
+    """(m, (M - 1) * fine + 1, 2) places along (m, M, 2) polylines."""
+    n = path.shape[1]
+    t = np.linspace(0, n - 1, (n - 1) * fine + 1)
+    i = np.minimum(t.astype(int), n - 2)
+    f = (t - i)[None, :, None]
+    return path[:, i] * (1 - f) + path[:, i + 1] * f
+
+
+def _open(surface: Surface, path: Float) -> Bool:
+    """(m,) whether nothing separates the places along each line."""
+    longest = np.abs(np.diff(path, axis=1)).max()
+    fine = int(np.ceil(max(longest, 1e-9) / 0.8))
+    return np.asarray(joined_places(surface.layers, _dense(path, fine))[1].all(axis=1))
+
+
+def _points(surface: Surface, rc: Float) -> tuple[Float, Float]:
+    """(m, M, 3) points and (m, M, 3, 2) tangents at (m, M, 2) grid places."""
     flat = rc.reshape(-1, 2)
-    depth, slope, supported = depth_at(surface, flat)
+    depth, slope, _ = depth_at(surface, flat)
     points = surface.rays.to_points(flat, depth)
     tangents = np.stack(surface.rays.tangents(flat, depth, slope), axis=-1)
     m, n = rc.shape[:2]
-    return points.reshape(m, n, 3), tangents.reshape(m, n, 3, 2), supported.reshape(m, n)
+    return points.reshape(m, n, 3), tangents.reshape(m, n, 3, 2)
 
 
-def _relax(surface: Surface, path: Float, progress: Progress) -> tuple[Float, Bool]:
-    """Gauss-Newton on the energy of zero-length springs, one banded system for all lines."""
+def relax_newton(surface: Surface, path: Float, progress: Progress) -> tuple[Float, Bool, Bool]:
+    """Gauss-Newton on the energy of zero-length springs: all nodes of all lines in one banded system.
+
+    Nodes that would leave the observed surface are held where they are.
+
+    Returns
+    -------
+    path (m, M, 2), held (m, M), converged (m,)
+    """
     m, n = path.shape[:2]
+    path = path.copy()
+    held = np.zeros((m, n), bool)
     converged = np.zeros(m, bool)
-    for step in range(25):
-        progress("geodesics", step / 25)
+    length = np.full(m, 1e9)
+    change_of_length = np.ones(m)
+    for step in range(STEPS):
+        progress("geodesics", 0.3 + 0.6 * step / STEPS)
         live = np.flatnonzero(~converged)
         if not len(live):
             break
-        points, tangents, _ = _points(surface, path[live])
-        change = _newton_step(points, tangents)
+        points, tangents = _points(surface, path[live])
+        now = np.linalg.norm(np.diff(points, axis=1), axis=2).sum(axis=1)
+        change = _newton_step(points, tangents, held[live, 1:-1])
         size = np.abs(change).max(axis=(1, 2))
-        path[live, 1:-1] += change * np.minimum(1.0, 8.0 / np.maximum(size, 1e-12))[:, None, None]
-        np.clip(path, 0, np.array(surface.layers.valid.shape) - 1.0, out=path)
-        converged[live] = size < 0.02
-    return path, converged
+        change_of_length[live] = np.abs(now / length[live] - 1)
+        converged[live] = (size < 0.02) | (change_of_length[live] < 1e-5)
+        length[live] = now
+        change *= np.minimum(1.0, 6.0 / np.maximum(size, 1e-12))[:, None, None]
+        moved, stuck = _allowed(surface, path[live], change)
+        path[live] = moved
+        held[live, 1:-1] |= stuck
+    return path, held, converged | (change_of_length < 5e-4)
 
 
-def _newton_step(points: Float, tangents: Float) -> Float:
+def _allowed(surface: Surface, path: Float, change: Float) -> tuple[Float, Bool]:
+    """The path after the change, without the moves of nodes that would leave the surface."""
+    moved = path.copy()
+    moved[:, 1:-1] += change
+    pair = np.stack([path[:, 1:-1], moved[:, 1:-1]], axis=2).reshape(-1, 2, 2)
+    steps = int(np.ceil(max(float(np.abs(change).max()), 1e-9) / 0.8))
+    was = joined_places(surface.layers, pair[:, :1])[0][:, 0]
+    free = joined_places(surface.layers, _dense(pair, steps))[1].all(axis=1)
+    stuck = (was & ~free).reshape(change.shape[:2])
+    moved[:, 1:-1][stuck] = path[:, 1:-1][stuck]
+    return moved, stuck
+
+
+def _newton_step(points: Float, tangents: Float, held: Bool) -> Float:
     """(m, M - 2, 2) step of the inner nodes."""
     m, n = points.shape[:2]
     pull = points[:, :-2] - 2 * points[:, 1:-1] + points[:, 2:]
-    inner = tangents[:, 1:-1]
+    inner = np.where(held[..., None, None], 0.0, tangents[:, 1:-1])
     right = np.einsum("mnki,mnk->mni", inner, pull)
     diagonal = 2 * np.einsum("mnki,mnkj->mnij", inner, inner)
     coupling = -np.einsum("mnki,mnkj->mnij", inner[:, :-1], inner[:, 1:])
+    own = np.stack([diagonal[..., 0, 0], diagonal[..., 1, 1]], axis=-1)
     band = np.zeros((4, m, n - 2, 2))  # upper form of solveh_banded: band[3 + i - j, j]
-    band[3] = np.stack([diagonal[..., 0, 0], diagonal[..., 1, 1]], axis=-1) * (1 + 1e-6)
+    band[3] = np.where(held[..., None], 1.0, own * (1 + 1e-6))
     band[2, :, :, 1] = diagonal[..., 0, 1]
     band[2, :, 1:, 0] = coupling[..., 1, 0]
     band[1, :, 1:, 0] = coupling[..., 0, 0]
@@ -120,14 +193,43 @@ def _newton_step(points: Float, tangents: Float) -> Float:
     return solved.reshape(m, n - 2, 2)
 
 
-def _measure(surface: Surface, path: Float, fine: int = 4) -> tuple[Float, Float, Bool]:
-    """Nodes, lengths and whether all of each line is observed; chords refined and extrapolated."""
-    m, n = path.shape[:2]
-    t = np.linspace(0, n - 1, (n - 1) * fine + 1)
-    i = np.minimum(t.astype(int), n - 2)
-    f = (t - i)[None, :, None]
-    dense = path[:, i] * (1 - f) + path[:, i + 1] * f
-    points, _, supported = _points(surface, dense)
-    chord = np.linalg.norm(np.diff(points, axis=1), axis=2).sum(axis=1)
-    coarse = np.linalg.norm(np.diff(points[:, ::2], axis=1), axis=2).sum(axis=1)
-    return points[:, ::fine], (4 * chord - coarse) / 3, supported.all(axis=1)
+def _describe(surface: Surface, path: Float, held: Bool, converged: Bool, apart: Bool) -> Geodesics:
+    """Lengths, standard deviations and reasons of relaxed lines."""
+    dense = _dense(path, FINE)
+    points, tangents = _points(surface, dense)
+    del tangents
+    segment = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    coarse = np.linalg.norm(np.diff(points[:, ::2], axis=1), axis=2)
+    # chords are short by a multiple of their squared length: extrapolate (Richardson 1911)
+    length = (4 * segment.sum(axis=1) - coarse.sum(axis=1)) / 3
+    closed = ~_open(surface, path)
+    reason = np.select(
+        [apart | closed, held.any(axis=1), ~converged],
+        [np.where(_is_jump(surface, path), JUMP, MISSING), BENT, NOT_CONVERGED],
+        OK,
+    ).astype(np.uint8)
+    sigma = np.hypot(_end_sigma(surface, dense, points), 5e-4 * length)
+    sigma = np.hypot(sigma, np.where(reason == OK, 0.0, 0.05 * length))
+    return Geodesics(points[:, ::FINE], length, sigma, reason != OK, reason)
+
+
+def _is_jump(surface: Surface, path: Float) -> Bool:
+    """(m,) whether depth jumps where a line is not on one piece."""
+    points, _ = _points(surface, _dense(path, FINE))
+    step = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    return np.asarray(step.max(axis=1) > 6 * np.median(step, axis=1))
+
+
+def _end_sigma(surface: Surface, dense: Float, points: Float) -> Float:
+    """Standard deviation of the length from the noise of both ends along their rays."""
+    shape = np.array(surface.layers.valid.shape) - 1
+    total = np.zeros(len(dense))
+    for end, towards in ((0, 2), (-1, -3)):
+        place = np.clip(np.round(dense[:, end]).astype(int), 0, shape)
+        direction = points[:, towards] - points[:, end]
+        direction /= np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
+        ray = surface.rays.rays(dense[:, end])
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        along = np.einsum("mi,mi->m", direction, ray)
+        total += (surface.sigma_grid_m[place[:, 0], place[:, 1]] * along) ** 2
+    return np.sqrt(total)

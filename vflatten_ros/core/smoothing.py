@@ -134,6 +134,21 @@ def tangent_fits(
     return _to_rays(rays, rc, middle, axes, surface, width_m, gain)
 
 
+def plane_fits(rays: RayGrid, rc: Float, foot: Float, normal: Float) -> Float:
+    """(k, 6) fits of planes through (k, 3) feet with (k, 3) normals at (k, 2) grid places."""
+    ray = rays.rays(rc)
+    base = rays.to_points(rc, np.zeros(len(rc)))
+    facing = np.einsum("ki,ki->k", normal, ray)
+    depth = np.einsum("ki,ki->k", normal, foot - base) / facing
+    d_row = rays.e_row + depth[:, None] * rays.ray_row
+    d_col = rays.e_col + depth[:, None] * rays.ray_col
+    fits = np.zeros((len(rc), 6))
+    fits[:, 0] = depth
+    fits[:, 1] = -np.einsum("ki,ki->k", normal, d_row) / facing
+    fits[:, 2] = -np.einsum("ki,ki->k", normal, d_col) / facing
+    return fits
+
+
 def _principal_axes(away: Float, weight: Float) -> Float:
     """(k, 3, 3) rows: two tangents and the normal."""
     total = weight.sum(axis=1)

@@ -14,7 +14,8 @@ from vflatten_ros.core.breaks import Layers, connected_window, find_layers
 from vflatten_ros.core.config import SurfaceConfig
 from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.raygrid import RayGrid, camera_rays, parallel_rays
-from vflatten_ros.core.smoothing import quadratic_image, slope_at, tangent_fits, value_at
+from vflatten_ros.core.smoothing import plane_fits, quadratic_image, slope_at, tangent_fits, value_at
+from vflatten_ros.core.weighted_planes import linear_fit, view_frame
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 CHUNK = 2000  # places fitted at a time, so that the arrays stay in the cache
@@ -35,6 +36,7 @@ class Surface:
     sigma_grid_m: Float  # (rows, cols) standard deviation of depth along the ray
     noise_m: float  # standard deviation of the input along the ray
     spacing_m: float  # distance of grid lines across the rays
+    toward: Float  # (3,) unit, mean direction to the viewer
     config: SurfaceConfig
 
 
@@ -87,7 +89,10 @@ def fit_surface(
     progress("surface", 0.5)
     fits, gain = quadratic_image(image, seen, layers.valid, width)
     special = _special(layers, fits, cell, int(np.ceil(2 * width)))
-    _refit(rays, layers, measured, special, width * cell, fits, gain)
+    if config.fit == "linear":
+        fits = _linear_fits(points, toward, rays, layers, measured, fits, cell, config.radius_m)
+    else:
+        _refit(rays, layers, measured, special, width * cell, fits, gain)
     progress("surface", 0.9)
     return _assemble(points, toward, rays, rc, fits, layers, noise * np.sqrt(gain), noise, cell, config)
 
@@ -101,10 +106,11 @@ def _assemble(
     depth, slope = value_at(fits[at], offset), slope_at(fits[at], offset)
     normals = np.cross(*rays.tangents(rc, depth, slope))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    mean = toward.mean(axis=0)
     normals *= np.where(np.einsum("ij,ij->i", normals, toward) < 0, -1.0, 1.0)[:, None]
     return Surface(
         rays.to_points(rc, depth), normals, sigma[at], layers.label[at], points, rays, fits, layers,
-        sigma, noise, cell, config,
+        sigma, noise, cell, mean / np.linalg.norm(mean), config,
     )  # fmt: skip
 
 
@@ -137,6 +143,23 @@ def _refit(
         )
         fits[r[good], c[good]] = fit[good]
         gain[r[good], c[good]] = variance[good]
+
+
+def _linear_fits(
+    points: Float, toward: Float, rays: RayGrid, layers: Layers, measured: Float, fits: Float,
+    cell: float, radius_m: float,
+) -> Float:  # fmt: skip
+    """The paper's planes z(x, y) at the grid places, where enough points are near."""
+    frame = view_frame(toward.mean(axis=0))
+    local = points @ frame.T
+    at = measured.reshape(-1, 3)[layers.source[layers.valid]] @ frame.T
+    most = int(3.3 * (radius_m / cell) ** 2) + 12
+    z, normal, supported = linear_fit(local, cKDTree(local[:, :2]), at[:, :2], radius_m, most)
+    foot = np.concatenate([at[:, :2], z[:, None]], axis=1) @ frame
+    planes = plane_fits(rays, np.argwhere(layers.valid).astype(float), foot, normal @ frame)
+    out = fits.copy()
+    out[layers.valid] = np.where(supported[:, None], planes, fits[layers.valid])
+    return out
 
 
 def _depth_image(points: Float, rays: RayGrid, rc: Float, organised: bool) -> tuple[Float, Bool]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vflatten_ros.core.arrays import frozen
 from vflatten_ros.core.errors import InvalidCloud
 from vflatten_ros.core.values import Byte, Cloud
 
@@ -64,7 +66,8 @@ def decode_cloud(
     Returns
     -------
     Cloud
-        xyz float32 (rows, cols, 3) in metres, NaN where unmeasured. rgb may view `data`.
+        xyz float32 (rows, cols, 3) in metres, NaN where unmeasured; read-only. xyz and rgb are
+        views of `data` where its layout allows.
 
     Raises
     ------
@@ -160,27 +163,36 @@ def _column(points: Byte, field: PointField, order: str) -> NDArray[Any]:
 def _decode_xyz(
     points: Byte, fields: list[PointField], order: str, zero_is_unmeasured: bool
 ) -> NDArray[np.float32]:
-    xyz = np.empty((*points.shape[:2], 3), np.float32)
-    if not xyz.size:
-        return xyz
-    offsets = [field.offset for field in fields]
-    float32 = all(field.datatype == FLOAT32 for field in fields)
-    if float32 and np.diff(offsets).tolist() == [4, 4]:
-        block: NDArray[np.float32] = np.ndarray(
-            xyz.shape, order + "f4", points, offset=offsets[0], strides=(*points.strides[:2], 4)
-        )
-        np.copyto(xyz, block)
-    else:
-        with np.errstate(over="ignore"):  # a float64 beyond float32 becomes inf, then NaN
-            for axis, field in enumerate(fields):
-                xyz[..., axis] = _column(points, field, order)
+    xyz = _gather_xyz(points, fields, order)
     x, y, z = np.moveaxis(xyz, 2, 0)
-    with np.errstate(invalid="ignore", over="ignore"):
-        size = np.abs(x) + np.abs(y) + np.abs(z)  # not finite where one of them is not
-    bad = ~np.isfinite(size)
+    with np.errstate(over="ignore", invalid="ignore"):
+        square = x * x
+        square += y * y
+        square += z * z
+    measured = square < np.inf  # False for NaN too
     if zero_is_unmeasured:
-        bad |= size == 0
-    xyz[bad] = np.nan
+        measured &= square > 0
+    # Most drivers write NaN where they measured nothing: then the message's own bytes will do.
+    wrong = ~measured & ~(np.isnan(x) & np.isnan(y) & np.isnan(z))
+    if wrong.any():
+        xyz = xyz.copy()
+        xyz[wrong] = np.nan
+    return frozen(xyz)
+
+
+def _gather_xyz(points: Byte, fields: list[PointField], order: str) -> NDArray[np.float32]:
+    """(rows, cols, 3) coordinates: a view of the data where they lie side by side as float32."""
+    shape = (*points.shape[:2], 3)
+    offsets = [field.offset for field in fields]
+    native = order == ("<" if sys.byteorder == "little" else ">")
+    side_by_side = offsets == [offsets[0], offsets[0] + 4, offsets[0] + 8]
+    if native and side_by_side and all(field.datatype == FLOAT32 for field in fields):
+        strides = (*points.strides[:2], 4)
+        return np.ndarray(shape, np.float32, points, offset=offsets[0], strides=strides)
+    xyz = np.empty(shape, np.float32)
+    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes inf
+        for axis, field in enumerate(fields):
+            xyz[..., axis] = _column(points, field, order)
     return xyz
 
 

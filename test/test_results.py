@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-
 from garments import CALIBRATION, example_garment, example_views
+
 from vflatten_ros import messages, results
 from vflatten_ros.core.geometry import rotation_about
 

@@ -44,7 +44,7 @@ def contour_fields(garment: FlatGarment) -> Fields:
 
 
 def points_fields(garment: FlatGarment, views: Sequence[View]) -> Fields:
-    """sensor_msgs/PointCloud2 of the used points: x, y, z in the clouds' frame, u, v, sigma in m."""
+    """sensor_msgs/PointCloud2 of the used points: x, y, z in the clouds' frame, u, v, sigma."""
     points = garment.points
     seen = points.view_id >= 0
     xyz = transform_points(_T_rig_hanger(garment, views), points.xyz_hanger[seen])

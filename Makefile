@@ -43,7 +43,7 @@ reproduce: bootstrap  ## The paper's experiments: docs/reproduction.md
 	@$(IN_ENV) python -m vflatten_ros.reproduce $(ARGS)
 
 docs: bootstrap  ## Regenerate docs/parameters.md from the defaults in the code
-	@$(IN_ENV) python scripts/write_parameters.py > build/parameters.md; mv build/parameters.md docs/parameters.md
+	@$(IN_ENV) python -m vflatten_ros.parameters > build/parameters.md; mv build/parameters.md docs/
 
 # Keeps the pins that still fit; UPGRADE=1 moves to the newest versions.
 COMPILE := ../build/uv/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \

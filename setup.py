@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: the version is package.xml's, and config/ is shipped."""
+"""What pyproject.toml cannot say: the version is package.xml's, and config/ and msg/ are shipped."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,11 @@ settings = [
 
 setup(
     version=version[1],
-    packages=[*find_packages(include=["vflatten_ros", "vflatten_ros.*"]), "vflatten_ros.config"],
-    package_dir={"vflatten_ros.config": "config"},
-    package_data={"vflatten_ros.config": settings},
+    packages=[
+        *find_packages(include=["vflatten_ros", "vflatten_ros.*"]),
+        "vflatten_ros.config",
+        "vflatten_ros.definitions",
+    ],
+    package_dir={"vflatten_ros.config": "config", "vflatten_ros.definitions": "msg"},
+    package_data={"vflatten_ros.config": settings, "vflatten_ros.definitions": ["*.msg"]},
 )

@@ -133,6 +133,10 @@ LINES
   mv env.sh.new env.sh
 }
 
+# Two runs at once would build over each other.
+exec 9< "$root"
+! command -v flock >/dev/null || flock 9
+
 command -v "$python" >/dev/null || check_tools
 if [ -f "$ros_setup" ]; then
   underlay=$ros_setup

@@ -1,0 +1,33 @@
+"""What every test run needs: a ROS domain of its own, and the marker of the tests under ros/."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+
+import pytest
+
+ROS_TESTS = Path(__file__).parent / "ros"
+HAS_ROS = importlib.util.find_spec("rclpy") is not None
+
+# Without ROS its tests are left out. `make test` has built it and says so: there they must run.
+collect_ignore = [] if HAS_ROS or os.environ.get("VFLATTEN_REQUIRE_ROS") else ["ros"]
+
+
+def pytest_configure() -> None:
+    # Neither another test run nor a robot on the network hears this one.
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+def pytest_report_header() -> str:
+    if not HAS_ROS:
+        return "ROS: none, the tests under test/ros are left out"
+    return f"ROS: domain {os.environ['ROS_DOMAIN_ID']}"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if ROS_TESTS in item.path.parents:
+            item.add_marker(pytest.mark.ros)

@@ -1,0 +1,125 @@
+"""The package as a whole: what it imports, its version, its settings and its files."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from vflatten_ros import resources
+from vflatten_ros.core.config import Config, config_from, flatten_config, sections
+from vflatten_ros.core.errors import InvalidConfig
+
+ROOT = Path(__file__).resolve().parent.parent
+CORE_MODULES = sorted(
+    f"vflatten_ros.core.{path.stem}" for path in (ROOT / "vflatten_ros" / "core").glob("[a-z]*.py")
+)
+
+
+def package_xml() -> ElementTree.Element:
+    return ElementTree.parse(ROOT / "package.xml").getroot()
+
+
+def run_python(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_core_imports_no_ros_no_files_and_no_plots():
+    unwanted = {"rclpy", "mcap", "yaml", "matplotlib", "tqdm", "vflatten_ros.msg"}
+    loaded = run_python(f"import sys, {', '.join(CORE_MODULES)}; print(*sys.modules)").split()
+    assert CORE_MODULES[0] in loaded
+    assert unwanted.isdisjoint(loaded)
+
+
+def test_versions_of_ros_and_pip_packages_agree():
+    version = package_xml().findtext("version")
+    done = subprocess.run(
+        [sys.executable, "setup.py", "--version"], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout.split()[-1] == version
+
+
+def test_changelog_has_the_version():
+    version = package_xml().findtext("version")
+    titles = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8").splitlines()
+    assert any(line.split(" ")[0] in (version, "Forthcoming") for line in titles)
+
+
+def test_every_default_survives_being_written_and_read_again():
+    assert config_from(flatten_config(Config())) == Config()
+
+
+def test_every_setting_has_a_description_that_ends_as_a_sentence():
+    for name, kind in sections():
+        for item in dataclasses.fields(kind):
+            assert item.metadata["doc"].endswith("."), f"{name}.{item.name}"
+
+
+@pytest.mark.parametrize("name", [n for n in flatten_config(Config()) if n != "method"])
+def test_every_setting_refuses_another_type(name: str):
+    with pytest.raises(InvalidConfig, match=name.rpartition(".")[2]):
+        config_from({name: [1]})
+
+
+def test_unknown_setting_is_refused_by_name():
+    with pytest.raises(InvalidConfig, match=r"surface\.radius_mm"):
+        config_from({"surface": {"radius_mm": 12.5}})
+
+
+def test_config_files_are_found_in_the_source_tree(monkeypatch):
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    assert (resources.config_path("categories") / "trousers.yaml").is_file()
+
+
+def test_config_files_are_found_in_a_ros_prefix(monkeypatch, tmp_path):
+    prefix = tmp_path / "install"
+    settings = prefix / "share" / "vflatten_ros" / "config"
+    settings.mkdir(parents=True)
+    (settings / "vflatten.yaml").touch()
+    installed = tmp_path / "lib" / "vflatten_ros"
+    monkeypatch.setattr(resources, "PACKAGE", installed)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/other:{prefix}")
+    assert resources.config_path("vflatten.yaml") == settings / "vflatten.yaml"
+
+
+def test_a_missing_config_file_tells_where_it_was_looked_for(monkeypatch, tmp_path):
+    monkeypatch.setattr(resources, "PACKAGE", tmp_path / "vflatten_ros")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "ros"))
+    with pytest.raises(InvalidConfig, match=r"nothing\.yaml.*ros/share/vflatten_ros/config"):
+        resources.config_path("nothing.yaml")
+
+
+def test_parameter_reference_is_up_to_date():
+    written = (ROOT / "docs" / "parameters.md").read_text(encoding="utf-8")
+    assert written == run_python("import vflatten_ros.parameters as p; print(p.reference())") + "\n", (
+        "run: make docs"
+    )
+
+
+@pytest.mark.slow
+def test_pip_installs_the_core_with_its_config_files(tmp_path):
+    """A wheel, unpacked far from the source tree, finds its categories and has the command."""
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in ("package.xml", "pyproject.toml", "setup.py", "README.md"):
+        shutil.copy(ROOT / name, source)
+    for name in ("config", "vflatten_ros"):
+        shutil.copytree(ROOT / name, source / name)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--target", str(tmp_path / "site"), str(source)], check=True, cwd=tmp_path)
+    found = subprocess.run(
+        [sys.executable, "-c", "import vflatten_ros.resources as r; print(r.config_path('categories'))"],
+        env={"PYTHONPATH": str(tmp_path / "site"), "PATH": ""},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert Path(found.stdout.strip()) == tmp_path / "site" / "vflatten_ros" / "config" / "categories"
+    assert (tmp_path / "site" / "bin" / "vflatten").is_file()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -10,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from vflatten_ros.core.values import Bool, Int
 
 Points = NDArray[np.float32]
+Labels = NDArray[Any]  # int32 or int64
 # Half of the 26 neighbours of a voxel; the other half are their opposites.
 HALF_NEIGHBOURS = [(0, 0, 1)] + [(0, 1, k) for k in (-1, 0, 1)]
 HALF_NEIGHBOURS += [(1, j, k) for j in (-1, 0, 1) for k in (-1, 0, 1)]
@@ -17,7 +21,7 @@ TABLE_CELLS = 8_000_000  # a table of voxels is faster than sorting them, up to 
 TRIALS = 100
 
 
-def pieces(points: Points, size_m: float) -> tuple[Int, Points, Int]:
+def pieces(points: Points, size_m: float) -> tuple[Labels, Labels]:
     """Occupied voxels, and which of them hang together by sides, edges or corners.
 
     Parameters
@@ -30,13 +34,11 @@ def pieces(points: Points, size_m: float) -> tuple[Int, Points, Int]:
     Returns
     -------
     voxel : (n,) voxel of each point
-    centres : (voxels, 3) mean of the points of each voxel
     label : (voxels,) piece of each voxel
     """
-    cell = np.floor(points / np.float32(size_m)).astype(np.int64)
-    cell -= cell.min(axis=0) - 1
-    nx, ny, nz = (int(extent) + 2 for extent in cell.max(axis=0))
-    key, voxel = _distinct((cell[:, 0] * ny + cell[:, 1]) * nz + cell[:, 2], nx * ny * nz)
+    cells, shape = _cells(points, size_m)
+    _, ny, nz = shape
+    key, voxel = _distinct(cells, math.prod(shape))
     first, second = [], []
     for i, j, k in HALF_NEIGHBOURS:
         wanted = key + (i * ny + j) * nz + k
@@ -47,22 +49,41 @@ def pieces(points: Points, size_m: float) -> tuple[Int, Points, Int]:
     pairs = (np.concatenate(first), np.concatenate(second))
     graph = coo_array((np.ones(len(pairs[0]), bool), pairs), shape=(len(key), len(key)))
     _, label = connected_components(graph, directed=False)
+    return voxel, label
+
+
+def centres(points: Points, voxel: Labels) -> Points:
+    """(voxels, 3) mean of the points in each voxel."""
     count = np.bincount(voxel)
-    centres = np.stack([np.bincount(voxel, points[:, k]) / count for k in range(3)], axis=1)
-    return voxel, centres.astype(np.float32), label.astype(np.int64)
+    means = [np.bincount(voxel, points[:, k]) / count for k in range(3)]
+    return np.stack(means, axis=1).astype(np.float32)
 
 
-def _distinct(keys: Int, cells: int) -> tuple[Int, Int]:
-    """Sorted distinct keys in [0, cells), and the place of each key among them."""
-    if cells > TABLE_CELLS:
-        distinct, place = np.unique(keys, return_inverse=True)
-        return distinct, place.reshape(-1)
-    occupied = np.zeros(cells, bool)
-    occupied[keys] = True
+def _cells(points: Points, size_m: float) -> tuple[Int, tuple[int, ...]]:
+    """Number of each point's voxel in a grid with an empty border, and the grid's shape."""
+    places = []
+    for k in range(3):
+        along = points[:, k] - points[:, k].min()
+        along *= np.float32(1.0 / size_m)
+        places.append(along.astype(np.int32))  # rounds down, as none is negative
+    shape = tuple(int(place.max()) + 3 for place in places)
+    wide = np.int32 if math.prod(shape) < 2**31 else np.int64
+    x, y, z = (place.astype(wide) + wide(1) for place in places)
+    cells: Int = (x * wide(shape[1]) + y) * wide(shape[2]) + z
+    return cells, shape
+
+
+def _distinct(cells: Int, total: int) -> tuple[Int, Labels]:
+    """Sorted distinct numbers in [0, total), and the place of each number among them."""
+    if total > TABLE_CELLS:
+        distinct, place = np.unique(cells, return_inverse=True)
+        return distinct.astype(np.int64), place.reshape(-1)
+    occupied = np.zeros(total, bool)
+    occupied[cells] = True
     distinct = np.flatnonzero(occupied)
-    table = np.empty(cells, np.int32)
-    table[distinct] = np.arange(len(distinct))
-    return distinct, table[keys].astype(np.int64)
+    table = np.empty(total, np.int32)
+    table[distinct] = np.arange(len(distinct), dtype=np.int32)
+    return distinct, table[cells]
 
 
 def dominant_plane(points: Points, tolerance_m: float) -> tuple[Points, Bool]:

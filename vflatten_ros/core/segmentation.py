@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.arrays import frozen
 from vflatten_ros.core.config import SegmentationConfig
 from vflatten_ros.core.errors import EmptyView
-from vflatten_ros.core.pieces import dominant_plane, pieces, plane_distance
+from vflatten_ros.core.pieces import centres, dominant_plane, pieces, plane_distance
 from vflatten_ros.core.values import Bool, Calibration, Cloud, Int, View
 
 Points = NDArray[np.float32]
@@ -157,6 +157,9 @@ def _walls(
     thinning = max(len(around) // SAMPLE, 1)
     evidence = flat[around[::thinning]]
     enough = max(config.wall_area_m2 / (spacing**2 * thinning), 3)
+    if len(evidence) < enough:
+        return on_any, beside_any
+    points = flat[index]
     for _ in range(WALLS):
         if len(evidence) < enough:
             break
@@ -164,11 +167,11 @@ def _walls(
         if on.sum() < enough:
             break
         evidence = evidence[~on]
-        distance = plane_distance(flat[index], plane)
+        distance = plane_distance(points, plane)
         candidates = np.flatnonzero(distance < config.wall_m)
         if not foreign[candidates].any():
             continue
-        voxel, _, label = pieces(flat[index[candidates]], max(2.0 * config.link_m, 3.0 * spacing))
+        voxel, label = pieces(points[candidates], max(2.0 * config.link_m, 3.0 * spacing))
         from_outside = np.bincount(label[voxel], weights=foreign[candidates]) > 0
         on_any[candidates[from_outside[label[voxel]]]] = True
         beside_any |= distance < config.wall_m + config.link_m
@@ -235,11 +238,11 @@ def _held(
     A piece with a foreign point is background, unless it is the nearest to the tip: then item and
     background touch.
     """
-    voxel, centres, label = pieces(points, link)
+    voxel, label = pieces(points, link)
     piece = label[voxel]
     large = np.bincount(piece) * spacing**2 > config.piece_area_m2
     own = np.bincount(piece, weights=foreign) == 0
-    places = _squeezed(centres, calibration)
+    places = _squeezed(centres(points, voxel), calibration)
     distance = np.linalg.norm(places, axis=1)
     distance[~large[label]] = np.inf
     own[label[distance.argmin()]] = True

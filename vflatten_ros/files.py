@@ -1,16 +1,20 @@
-"""Calibration and protocol files."""
+"""Calibration, protocol and settings files."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from vflatten_ros.core.calibration import calibration_from
-from vflatten_ros.core.errors import InvalidCalibration, InvalidCorrespondence
+from vflatten_ros.core.config import Config, config_from, flatten_config
+from vflatten_ros.core.errors import InvalidCalibration, InvalidConfig, InvalidCorrespondence
 from vflatten_ros.core.values import Calibration, Correspondence
+from vflatten_ros.parameters import entries
 
 CALIBRATION_NAME = "calibration.yaml"
 
@@ -74,6 +78,55 @@ def load_protocol(path: str | Path) -> tuple[tuple[int, ...], tuple[Corresponden
             f"...]; trouble with {_one_line(error)}"
         ) from error
     return views, tuple(Correspondence(first, second, a, b) for a, b in pairs)
+
+
+def load_config(path: str | Path) -> Config:
+    """Read the method's settings from a ROS parameter file; the node's own are passed over.
+
+    Parameters
+    ----------
+    path : path
+        YAML as config/vflatten.yaml, or the settings alone without `ros__parameters`.
+
+    Raises
+    ------
+    InvalidConfig
+        The file is missing, no YAML, or names an unknown setting or a wrong value.
+    """
+    path = Path(path)
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except FileNotFoundError as error:
+        raise InvalidConfig(f"{path}: no such file; check --config") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InvalidConfig(f"{path}: cannot be read as YAML: {_one_line(error)}") from error
+    if not isinstance(values, Mapping):
+        raise InvalidConfig(f"{path}: expected settings, name: value; got {type(values).__name__}")
+    given = dict(_settings(values))
+    core = flatten_config(Config())
+    known = set(core) | {entry.name for entry in entries()} | {"use_sim_time"}
+    unknown = sorted(set(given) - known)
+    if unknown:
+        near = get_close_matches(unknown[0], sorted(known), n=1)
+        hint = f"did you mean {near[0]!r}?" if near else "see docs/parameters.md"
+        raise InvalidConfig(f"{path}: unknown setting {unknown[0]!r}; {hint}")
+    try:
+        return config_from({name: value for name, value in given.items() if name in core})
+    except InvalidConfig as error:
+        raise InvalidConfig(f"{path}: {error}") from error
+
+
+def _settings(values: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Nested settings as 'section.name', value; the levels of node names are left out."""
+    for key, value in values.items():
+        if isinstance(value, Mapping) and "ros__parameters" in value:
+            yield from _settings(value["ros__parameters"] or {})
+        elif key == "ros__parameters":
+            yield from _settings(value or {})
+        elif isinstance(value, Mapping):
+            yield from _settings(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def _whole(value: Any) -> int:

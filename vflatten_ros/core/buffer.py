@@ -25,8 +25,8 @@ from vflatten_ros.core.joints import JointReading, JointStatus, JointTrack
 from vflatten_ros.core.segmentation import segment, view_at
 from vflatten_ros.core.turntable import (
     TURN,
-    angle_covered,
     angle_between,
+    angle_covered,
     crowded,
     rotation_complete,
 )
@@ -201,7 +201,7 @@ class ViewBuffer:
         return self._settle(now_ns)
 
     def finish(self) -> tuple[Event, ...]:
-        """No more messages will come: decide every waiting cloud with the joint states there are."""
+        """No more messages will come: decide every waiting cloud by the joint states there are."""
         return self._settle(self._now_ns, last=True)
 
     def new_item(self, cause: str = "requested") -> tuple[Event, ...]:

@@ -122,8 +122,8 @@ def _check_axis(point: Float, direction: Float, tip: Float) -> None:
     distance = float(np.linalg.norm(np.cross(point, direction)))
     if distance < 0.05:
         raise InvalidCalibration(
-            f"calibration: axis_point: the axis passes {distance:.3f} m from the rig's origin, where "
-            "the camera is; check axis_point and axis_direction"
+            f"calibration: axis_point: the axis passes {distance:.3f} m from the rig's origin, "
+            "where the camera is; check axis_point and axis_direction"
         )
     offset = float(np.linalg.norm(np.cross(tip - point, direction)))
     if offset > MAX_TIP_OFFSET_M:

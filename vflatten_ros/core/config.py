@@ -59,7 +59,10 @@ class JointConfig(Checked):
     """Wrist angle at a cloud's stamp."""
 
     max_age_s: float = option(
-        0.1, "Farthest either joint state may be from the cloud's stamp between them, s.", low=0.001, high=10.0
+        0.1,
+        "Farthest either joint state may be from the cloud's stamp between them, s.",
+        low=0.001,
+        high=10.0,
     )
     wait_s: float = option(
         1.0, "How long a cloud waits for its joint states, s.", low=0.0, high=60.0
@@ -78,7 +81,10 @@ class SegmentationConfig(Checked):
         2.5, "Farthest an item point may hang below the gripper tip, m.", low=0.1, high=10.0
     )
     tip_clearance_m: float = option(
-        0.008, "Points less than this below the gripper tip are the gripper's, m.", low=-0.1, high=0.5
+        0.008,
+        "Points less than this below the gripper tip are the gripper's, m.",
+        low=-0.1,
+        high=0.5,
     )
     link_m: float = option(0.015, "Points nearer than this are one piece, m.", low=0.003, high=0.1)
     gap_m: float = option(
@@ -101,7 +107,10 @@ class SegmentationConfig(Checked):
         0.015, "Half the thickness taken for a wall or table, m.", low=0.001, high=0.1
     )
     wall_area_m2: float = option(
-        0.05, "Planes that show less area outside of the radius are no walls, m2.", low=0.001, high=10.0
+        0.05,
+        "Planes that show less area outside of the radius are no walls, m2.",
+        low=0.001,
+        high=10.0,
     )
     min_points: int = option(100, "Views with fewer item points are dropped.", low=3, high=100000)
 
@@ -119,7 +128,10 @@ class BufferConfig(Checked):
         2.0, "Views nearer in angle replace one another, the better stays, deg.", low=0.0, high=45.0
     )
     max_rate_rad_s: float = option(
-        0.0, "Clouds taken while the wrist turns faster are dropped, rad/s; 0: never.", low=0.0, high=100.0
+        0.0,
+        "Clouds taken while the wrist turns faster are dropped, rad/s; 0: never.",
+        low=0.0,
+        high=100.0,
     )
     swing_m: float = option(
         0.03,
@@ -129,18 +141,27 @@ class BufferConfig(Checked):
         high=1.0,
     )
     max_gap_deg: float = option(
-        45.0, "Largest angle between neighbouring views of a complete rotation, deg.", low=1.0, high=180.0
+        45.0,
+        "Largest angle between neighbouring views of a complete rotation, deg.",
+        low=1.0,
+        high=180.0,
     )
     min_views: int = option(6, "Fewest views of a complete rotation.", low=2, high=1000)
     clock_jump_s: float = option(
-        1.0, "Stamps that step back by more mean that the clock was set back, s.", low=0.01, high=3600.0
+        1.0,
+        "Stamps that step back by more mean that the clock was set back, s.",
+        low=0.01,
+        high=3600.0,
     )
     finger_joints: str = option(
         "finger_left,finger_right",
         "Joints whose opening and closing starts a new item, by commas; empty: none.",
     )
     finger_open: float = option(
-        0.02, "Fingers are open where their mean position is above this, m or rad.", low=-10.0, high=10.0
+        0.02,
+        "Fingers are open where their mean position is above this, m or rad.",
+        low=-10.0,
+        high=10.0,
     )
     finger_closed: float = option(
         0.01, "Open fingers are closed again below this, m or rad.", low=-10.0, high=10.0

@@ -78,7 +78,7 @@ class JointTrack:
         self._turns.clear()
 
     def add(self, stamp_ns: int, position_rad: float) -> bool:
-        """Add one sample; False if it is not finite, a repeated stamp, or older than the history."""
+        """Add one sample; False if not finite, of a stamp already there, or before the history."""
         if not math.isfinite(position_rad):
             return False
         place = bisect_left(self._stamps, stamp_ns)

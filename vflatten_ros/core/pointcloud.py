@@ -130,7 +130,8 @@ def _check_field(field: PointField, point_step: int) -> None:
         )
     if field.name in ("x", "y", "z") and field.datatype not in (FLOAT32, FLOAT64):
         raise InvalidCloud(
-            f"field {field.name!r} has datatype {field.datatype}; expected 7 (float32) or 8 (float64)"
+            f"field {field.name!r} has datatype {field.datatype}; "
+            "expected 7 (float32) or 8 (float64)"
         )
 
 
@@ -204,5 +205,7 @@ def _decode_rgb(points: Byte, fields: dict[str, PointField], order: str) -> Byte
         return colours
     separate = [fields.get(name) for name in ("r", "g", "b")]
     if all(field is not None and field.datatype == 2 for field in separate):
-        return np.stack([points[..., f.offset] for f in separate if f is not None], axis=2)
+        planes = [_column(points, field, order) for field in separate if field is not None]
+        rgb: Byte = np.stack(planes, axis=2)
+        return rgb
     return None

@@ -117,8 +117,12 @@ def _near_axis(
     near = (depth > min(tip[2], bottom[2]) - reach) & (depth < max(tip[2], bottom[2]) + reach)
     index = np.flatnonzero(near)
     offset = [flat[:, k][index] - np.float32(point[k]) for k in range(3)]
-    height = sum(offset[k] * np.float32(up[k]) for k in range(3))
-    square = sum(part * part for part in offset) - height * height
+    height = np.zeros(len(index), np.float32)
+    square = np.zeros(len(index), np.float32)
+    for k in range(3):
+        height += offset[k] * np.float32(up[k])
+        square += offset[k] * offset[k]
+    square -= height * height
     low = np.float32((tip - point) @ up)
     below = (height < low - config.tip_clearance_m) & (height > low - config.length_m)
     inside = below & (square < (config.radius_m + config.link_m) ** 2)
@@ -246,7 +250,8 @@ def _held(
     distance = np.linalg.norm(places, axis=1)
     distance[~large[label]] = np.inf
     own[label[distance.argmin()]] = True
-    return _reached(places, label, large & own, config.gap_m + link)[piece]
+    held: Bool = _reached(places, label, large & own, config.gap_m + link)[piece]
+    return held
 
 
 def _squeezed(points: Points, calibration: Calibration) -> Points:

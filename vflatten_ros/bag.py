@@ -272,8 +272,8 @@ def _topics_of(path: Path) -> list[Topic]:
     except BROKEN as error:
         if not seen:
             raise InvalidRecording(
-                f"{path}: ends early or is damaged, and no message can be read ({_one_line(error)}); "
-                "record it again or try 'mcap recover'"
+                f"{path}: ends early or is damaged, and no message can be read "
+                f"({_one_line(error)}); record it again or try 'mcap recover'"
             ) from error
     return list(seen.values())
 
@@ -363,8 +363,8 @@ def _check_views(recording: Recording, calibration: Calibration, buffer: ViewBuf
     if calibration.joint not in state.joints_seen:
         names = ", ".join(state.joints_seen) or "none"
         raise InvalidRecording(
-            f"{where}: no joint {calibration.joint!r} on {recording.joint_topic} (joints: {names}); "
-            f"correct 'joint' in the calibration{_also(recording)}"
+            f"{where}: no joint {calibration.joint!r} on {recording.joint_topic} "
+            f"(joints: {names}); correct 'joint' in the calibration{_also(recording)}"
         )
     if not state.view_ids:
         drops = ", ".join(f"{reason} {count}" for reason, count in state.drops.items())

@@ -19,7 +19,7 @@ from vflatten_ros.core.arrays import frozen
 from vflatten_ros.core.config import SegmentationConfig
 from vflatten_ros.core.errors import EmptyView
 from vflatten_ros.core.pieces import centres, dominant_plane, pieces, plane_distance
-from vflatten_ros.core.values import Bool, Calibration, Cloud, Int, View
+from vflatten_ros.core.values import Bool, Calibration, Cloud, Float, Int, View
 
 Points = NDArray[np.float32]
 Pixels = NDArray[np.int32]
@@ -75,13 +75,14 @@ def segment(cloud: Cloud, calibration: Calibration, config: SegmentationConfig) 
     flat = cloud.xyz.reshape(-1, 3)
     index, foreign, around = _near_axis(flat, calibration, config)
     _check_count(len(index), config)
-    spacing = _spacing(cloud, index)
+    spacing = point_spacing(cloud, index)
     link = max(config.link_m, 3.0 * spacing)
 
     wall, at_wall = _walls(flat, index, foreign, around, spacing, config)
     index, foreign = index[~wall], (foreign | at_wall)[~wall]
-    supported = _supported(cloud, index, spacing, calibration, config)
-    index, foreign = index[supported], foreign[supported]
+    up = np.array(calibration.axis_direction)
+    kept = has_support(cloud, index, spacing, up, config)
+    index, foreign = index[kept], foreign[kept]
     _check_count(len(index), config)
     held = _held(flat[index], foreign, spacing, link, calibration, config)
     index = index[held & ~foreign]
@@ -130,8 +131,8 @@ def _near_axis(
     return index[inside], square[inside] > config.radius_m**2, index[around]
 
 
-def _spacing(cloud: Cloud, index: Int) -> float:
-    """Typical distance between neighbouring points, m."""
+def point_spacing(cloud: Cloud, index: Int) -> float:
+    """Typical distance between neighbouring points of those with the (n,) flat indices, m."""
     flat = cloud.xyz.reshape(-1, 3)
     if cloud.organised:
         beside = index[:-1][np.diff(index) == 1]
@@ -182,10 +183,26 @@ def _walls(
     return on_any, beside_any
 
 
-def _supported(
-    cloud: Cloud, index: Int, spacing: float, calibration: Calibration, config: SegmentationConfig
+def has_support(
+    cloud: Cloud, index: Int, spacing: float, up: Float, config: SegmentationConfig
 ) -> Bool:
-    """Points with enough neighbours at their depth; flying pixels between two layers have none."""
+    """Which points have enough neighbours at their depth; flying pixels between layers have none.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    index : ndarray of shape (n,)
+        Flat indices of the points, ascending; the others do not count as neighbours.
+    spacing : float
+        Distance between neighbouring points, m.
+    up : ndarray of shape (3,)
+        Upward direction, rig frame.
+    config : SegmentationConfig
+
+    Returns
+    -------
+    ndarray of shape (n,), bool
+    """
     tolerance = max(config.support_m, 3.0 * spacing)
     if not cloud.organised:
         points = cloud.xyz.reshape(-1, 3)[index]
@@ -195,8 +212,7 @@ def _supported(
     row, col = np.divmod(index, cloud.xyz.shape[1])
     # Four times as long along the axis as across: cloth seen edge-on is a narrow upright strip.
     step = max(1, round(0.25 * config.support_m / spacing))
-    x, y, _ = np.abs(calibration.axis_direction)
-    high, wide = (4 * step, step) if y >= x else (step, 4 * step)
+    high, wide = (4 * step, step) if abs(up[1]) >= abs(up[0]) else (step, 4 * step)
     row, col = row - (row.min() - high), col - (col.min() - wide)
     depth = np.full((row.max() + high + 1, col.max() + wide + 1), np.nan, np.float32)
     depth[row, col] = cloud.xyz.reshape(-1, 3)[index, 2]

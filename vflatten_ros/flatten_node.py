@@ -1,0 +1,306 @@
+"""The lifecycle node: gathers views beside the robot, answers a planner, flattens, publishes."""
+
+from __future__ import annotations
+
+import os
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+from rclpy.clock import Clock, JumpThreshold
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+
+from vflatten_ros.bag import cloud_from, stamp_ns
+from vflatten_ros.categories import load_templates
+from vflatten_ros.core.buffer import (
+    ClockJumped,
+    CloudDropped,
+    Event,
+    ItemStarted,
+    RotationComplete,
+)
+from vflatten_ros.core.calibration import calibration_from
+from vflatten_ros.core.errors import InvalidCloud, InvalidConfig
+from vflatten_ros.core.values import Calibration, FlatGarment
+from vflatten_ros.files import load_calibration
+from vflatten_ros.frames import Frames
+from vflatten_ros.goals import Goals, Listener, Task
+from vflatten_ros.node_inputs import Inputs, Throttle
+from vflatten_ros.node_lifecycle import ACTIVE, AnsweringLifecycleNode
+from vflatten_ros.node_outputs import (
+    ERROR,
+    OK,
+    Outputs,
+    Status,
+    buffer_message,
+    buffer_status,
+    flattening_status,
+)
+from vflatten_ros.node_services import Services, summary
+from vflatten_ros.parameters import CalibrationOptions, Parameters, Settings
+from vflatten_ros.session import NOT_ACTIVE, Refused, Session
+from vflatten_ros.worker import Outcome, Prepare, Worker
+
+TICK_S = 0.05
+DIAGNOSTICS_S = 1.0
+
+
+class FlattenNode(AnsweringLifecycleNode):
+    """Everything runs in one thread, the executor's; flattening runs in another process."""
+
+    def __init__(
+        self, name: str = "vflatten", prepare: Callable[[str], Prepare] | None = None
+    ) -> None:
+        """Create the node, unconfigured.
+
+        Parameters
+        ----------
+        name : str
+            Node name, unless remapped.
+        prepare : callable, optional
+            Folder of the categories -> what the worker runs; for tests.
+
+        Raises
+        ------
+        InvalidConfig
+            A parameter that was given has the wrong type or is out of range.
+        """
+        super().__init__(name)
+        self._prepare = prepare or _prepare_job
+        self.session: Session | None = None
+        self.goals: Goals | None = None
+        self.last_garment: FlatGarment | None = None
+        self.frames = Frames(self)
+        self.errors = 0  # of our own, caught by the main loop
+        self._finished = self._failed = 0
+        self._last = ""
+        self._throttle = Throttle()
+        self._declared = Parameters(self, lambda: self.lifecycle_state()[0] == ACTIVE)
+        self._results = Outputs(self)
+        self._sensors = Inputs(self, self._on_cloud, self._on_joints)
+        self._requests = Services(self)
+        self._worker_guard = self.create_guard_condition(self._on_worker)
+        # A paused /clock must stop neither time-outs nor diagnostics.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(TICK_S, self._on_tick, clock=steady)
+        self.create_timer(DIAGNOSTICS_S, self._on_diagnostics, clock=steady)
+        self._jump = self.get_clock().create_jump_callback(
+            JumpThreshold(
+                min_forward=None, min_backward=Duration(seconds=-1), on_clock_change=False
+            ),
+            post_callback=self._on_clock_jump,
+        )
+
+    @property
+    def settings(self) -> Settings:
+        """The parameters' present values."""
+        return self._declared.settings
+
+    def active_session(self) -> Session:
+        """The session; raises Refused while the node is not active."""
+        number, label = self.lifecycle_state()
+        if number != ACTIVE or self.session is None:
+            raise Refused(NOT_ACTIVE, f"the node is {label}; activate it first{self._why()}")
+        return self.session
+
+    def _why(self) -> str:
+        return f" (last try: {self.trouble})" if self.trouble else ""
+
+    # ---- lifecycle
+
+    def configure(self) -> None:
+        """Check the categories and start the flattening process."""
+        options = self.settings.node.node
+        load_templates(options.categories or None)
+        worker = Worker(
+            self._prepare(options.categories), self._worker_guard.trigger, options.worker_nice
+        )
+        self.goals = Goals(worker, lambda: self.settings.node.node.max_queued_goals)
+
+    def activate(self) -> None:
+        """Read the calibration, begin an empty buffer and subscribe."""
+        calibration = self._calibration(self.settings.node.calibration)
+        self.session = Session(calibration, self.settings.core)
+        self.last_garment = None
+        self._sensors.open(self.settings.node.clouds, self.settings.node.joint_states)
+        self.buffer_changed()
+        self.get_logger().info(
+            f"active: clouds in {calibration.frame} turned by {calibration.joint}, method "
+            f"{self.settings.core.method}"
+        )
+
+    def deactivate(self) -> None:
+        """Unsubscribe and cancel what is being flattened."""
+        self._sensors.close()
+        if self.goals is not None:
+            self.goals.cancel_all("the node was deactivated")
+
+    def cleanup(self) -> None:
+        """End the flattening process."""
+        if self.goals is not None:
+            self.goals.stop()
+        self.goals = self.session = self.last_garment = None
+
+    def _calibration(self, options: CalibrationOptions) -> Calibration:
+        if options.file:
+            return load_calibration(os.path.expanduser(options.file))
+        values: dict[str, Any] = {
+            name: getattr(options, name)
+            for name in ("frame", "axis_point", "axis_direction", "gripper_tip", "joint_zero")
+        }
+        values |= {"joint": options.joint, "joint_sign": options.joint_sign}
+        if options.tf_frame:
+            values |= self.frames.calibration_values(options)
+        elif not options.frame:
+            raise InvalidConfig(
+                "no calibration: set calibration.file, or calibration.frame and the numbers"
+            )
+        return calibration_from(values)
+
+    # ---- clouds and joint states
+
+    def _on_cloud(self, message: Any) -> None:
+        if self.session is None:
+            return
+        now = time.monotonic_ns()
+        try:
+            events = self.session.add_cloud(cloud_from(message), now)
+        except InvalidCloud as error:
+            events = self.session.reject_cloud(str(error), now)
+        except Exception as error:
+            self.errors += 1
+            self.warn("cloud", f"internal error with a cloud:\n{traceback.format_exc()}")
+            events = self.session.reject_cloud(f"internal error: {error}", now)
+        self.take_events(events)
+
+    def _on_joints(self, message: Any) -> None:
+        if self.session is not None:
+            stamp = stamp_ns(message.header.stamp)
+            now = time.monotonic_ns()
+            self.take_events(self.session.add_joint(stamp, message.name, message.position, now))
+
+    def take_events(self, events: Sequence[Event]) -> None:
+        """Log what an operator should know, publish the buffer, begin what a rotation asks for."""
+        for event in events:
+            self._note(event)
+        if events:
+            self.buffer_changed()
+        if any(isinstance(event, RotationComplete) for event in events):
+            self._flatten_by_itself()
+
+    def _note(self, event: Event) -> None:
+        log = self.get_logger()
+        if isinstance(event, ItemStarted):
+            self.last_garment = None
+            log.info(f"item {event.item} begins: {event.cause}")
+        elif isinstance(event, RotationComplete):
+            log.info(f"rotation complete: {event.views} views")
+        elif isinstance(event, ClockJumped):
+            back = (event.from_ns - event.to_ns) * 1e-9
+            log.warning(f"stamps went back by {back:.3f} s: the views of before are forgotten")
+        elif isinstance(event, CloudDropped) and event.reason not in ("duplicate_angle", "cleared"):
+            self.warn(event.reason, f"cloud {event.view_id} dropped, {event.reason}: {event.text}")
+
+    def buffer_changed(self) -> None:
+        """Publish the buffer's state and have its views at the worker."""
+        if self.session is not None:
+            self._results.publish_buffer(buffer_message(self.session))
+            if self.goals is not None:
+                self.goals.keep(self.session.buffer.views())
+
+    def _on_clock_jump(self, jump: Any) -> None:
+        """ROS time went back: views from the future cannot be followed by others."""
+        if self.session is None:
+            return
+        now = self.get_clock().now().nanoseconds
+        newest = max((view.stamp_ns for view in self.session.buffer.views()), default=0)
+        if newest > now:
+            self.get_logger().warning("ROS time went back: the views of before are forgotten")
+            self.take_events(self.session.new_item("ROS time went back"))
+
+    def warn(self, cause: str, text: str) -> None:
+        """Log a warning, unless one of the same cause was logged a moment ago."""
+        line = self._throttle.line(cause, text)
+        if line is not None:
+            self.get_logger().warning(line)
+
+    # ---- flattening
+
+    def progress(self) -> float:
+        """0-1 of the flattening that is being worked on."""
+        return self.goals.progress if self.goals is not None else 0.0
+
+    def _flatten_by_itself(self) -> None:
+        if not self.settings.node.node.auto_flatten or self.goals is None:
+            return
+        try:
+            task = self.active_session().task(self.settings.core)
+        except Refused:
+            return
+        self.goals.submit(task, Listener(lambda stage, fraction: None, self._log_failure))
+
+    def _log_failure(self, outcome: Outcome) -> None:
+        if outcome.garment is None and not outcome.cancelled:
+            self.warn("flatten", f"flattening by itself failed: {outcome.error}")
+
+    def _on_worker(self) -> None:
+        if self.goals is None:
+            return
+        for line in self.goals.handle_events():
+            self.get_logger().error(line)
+        for task, outcome in self.goals.take_finished():
+            self._on_outcome(task, outcome)
+
+    def _on_outcome(self, task: Task, outcome: Outcome) -> None:
+        if outcome.garment is None:
+            self._failed += not outcome.cancelled
+            self._last = "cancelled" if outcome.cancelled else outcome.error.splitlines()[0]
+            return
+        self._finished += 1
+        self._last = summary(outcome.garment)
+        if self.session is not None and task.item == self.session.buffer.state().item:
+            self.last_garment = outcome.garment
+        self._results.publish_result(outcome.messages, self.settings.node.outputs)
+        total = sum(outcome.seconds.values())
+        self.get_logger().info(f"item {task.item} flattened in {total:.2f} s: {self._last}")
+
+    # ---- timers
+
+    def _on_tick(self) -> None:
+        if self.session is not None and self.lifecycle_state()[0] == ACTIVE:
+            self.take_events(self.session.tick(time.monotonic_ns()))
+        if self.goals is not None:
+            for line in self.goals.check_deadlines():
+                self.get_logger().warning(line)
+
+    def _on_diagnostics(self) -> None:
+        for line in self._sensors.check_quiet(self.settings.node.node.no_data_warning_s):
+            self.get_logger().warning(line)
+        self._results.publish_diagnostics(self._statuses())
+
+    def _statuses(self) -> list[Status]:
+        _, label = self.lifecycle_state()
+        level = ERROR if self.trouble else OK
+        values = {"lifecycle": label, "internal errors": self.errors}
+        statuses: list[Status] = [(level, "node", self.trouble or label, values)]
+        statuses += self._sensors.statuses(self.settings.node.node.no_data_warning_s)
+        if self.session is not None:
+            statuses.append(buffer_status(self.session))
+        statuses.append(flattening_status(self.goals, self._finished, self._failed, self._last))
+        return statuses
+
+    def destroy_node(self) -> None:
+        """End the flattening process as well."""
+        if self.goals is not None:
+            self.goals.stop()
+        self._requests.destroy()
+        super().destroy_node()
+
+
+def _prepare_job(categories: str) -> Prepare:
+    from vflatten_ros import job
+
+    return partial(job.prepare, categories)

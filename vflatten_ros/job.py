@@ -1,0 +1,54 @@
+"""What the flattening process does with a job: the method, then the messages of its result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+from vflatten_ros import displays, messages
+from vflatten_ros.categories import load_templates
+from vflatten_ros.core.templates import Template
+from vflatten_ros.core.values import FlatGarment, Progress, View
+from vflatten_ros.picture import draw_flat
+from vflatten_ros.worker import Job, Work
+
+
+def prepare(categories: str) -> Work:
+    """Load the categories of a folder ("": those of the package)."""
+    import vflatten_ros.core.pipeline  # noqa: F401  now, so that the first job need not wait for it
+
+    return partial(flatten, load_templates(categories or None))
+
+
+def flatten(
+    templates: Sequence[Template], views: Sequence[View], job: Job, progress: Progress
+) -> tuple[FlatGarment, Mapping[str, bytes]]:
+    """Flatten, and serialize the messages of the outputs by the last part of their topic."""
+    from vflatten_ros.core.pipeline import flatten_garment  # not needed by the node's own process
+
+    garment = flatten_garment(views, job.correspondences, templates, job.config, progress)
+    progress("messages", 0.0)
+    return garment, serialized(garment, views)
+
+
+def serialized(garment: FlatGarment, views: Sequence[View]) -> dict[str, bytes]:
+    """Every message of a result, serialized: filling them would hold up the node's callbacks."""
+    from geometry_msgs.msg import PolygonStamped
+    from rclpy.serialization import serialize_message
+    from sensor_msgs.msg import Image, PointCloud2
+    from visualization_msgs.msg import MarkerArray
+
+    from vflatten_ros.msg import FlattenedView, GarmentEstimate
+
+    filled = {
+        "flattened_view": (FlattenedView, messages.flattened_view_fields(garment, views)),
+        "garment": (GarmentEstimate, messages.garment_estimate_fields(garment, views)),
+        "contour": (PolygonStamped, displays.contour_fields(garment)),
+        "markers": (MarkerArray, displays.marker_fields(garment, views)),
+        "image": (Image, displays.image_fields(draw_flat(garment), garment.stamp_ns)),
+        "points": (PointCloud2, displays.points_fields(garment, views)),
+    }
+    return {
+        topic: bytes(serialize_message(messages.fill(kind(), fields)))
+        for topic, (kind, fields) in filled.items()
+    }

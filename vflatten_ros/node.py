@@ -1,0 +1,99 @@
+"""Runs the node: `vflatten node`, `ros2 run vflatten_ros vflatten_node`."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+from vflatten_ros import transport
+from vflatten_ros.core.errors import VFlattenError
+from vflatten_ros.flatten_node import FlattenNode
+
+MAX_ERRORS = 1000  # in a row
+
+
+def spin(node: FlattenNode) -> None:
+    """Serve until the context is shut down; a mistake of ours costs one callback, not the node."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    in_a_row = 0
+    while rclpy.ok():
+        try:
+            executor.spin_once()
+            in_a_row = 0
+        except (ExternalShutdownException, KeyboardInterrupt):
+            break
+        except Exception:
+            if not rclpy.ok():
+                break
+            node.errors += 1
+            in_a_row += 1
+            node.warn("spin", f"internal error, please report it:\n{traceback.format_exc()}")
+            if in_a_row == MAX_ERRORS:  # nothing works any more: better to be started anew
+                raise
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        `--params-file FILE` and `--name NAME`, or ROS arguments after `--ros-args`; by default
+        those of the command line.
+
+    Returns
+    -------
+    int
+        0 after SIGINT, SIGTERM or a shutdown, 1 where a parameter is wrong.
+    """
+    transport.use_profile()
+    rclpy.init(args=[sys.argv[0], *_ros_arguments(sys.argv[1:] if argv is None else argv)])
+    try:
+        node = FlattenNode()
+    except VFlattenError as error:
+        print(f"vflatten node: {error}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return 1
+    try:
+        if node.settings.node.node.autostart:
+            node.autostart()
+        spin(node)
+    finally:
+        # A second Ctrl-C must not interrupt the end of the flattening process.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _ros_arguments(argv: Sequence[str]) -> list[str]:
+    """Our own short options as ROS arguments; everything from --ros-args on stays as it is."""
+    given = list(argv)
+    at = given.index("--ros-args") if "--ros-args" in given else len(given)
+    own, ros = given[:at], given[at:]
+    extra: list[str] = []
+    while own:
+        option = own.pop(0)
+        name, _, value = option.partition("=")
+        if name not in ("--params-file", "--name", "--calibration") or not (value or own):
+            raise SystemExit(
+                f"vflatten node: unknown option {option!r}; usage: vflatten node "
+                "[--params-file FILE] [--calibration FILE] [--name NAME] [--ros-args ...]"
+            )
+        value = value or own.pop(0)
+        extra += {
+            "--params-file": ["--params-file", value],
+            "--name": ["-r", f"__node:={value}"],
+            "--calibration": ["-p", f"calibration.file:={value}"],
+        }[name]
+    return [*(ros or (["--ros-args"] if extra else [])), *extra]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,187 @@
+"""Subscriptions of the node, and the warnings when nothing, or nothing usable, comes in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from sensor_msgs.msg import JointState, PointCloud2
+
+from vflatten_ros.node_outputs import OK, WARN, Status
+from vflatten_ros.parameters import CloudInput, JointInput
+
+REPEAT_S = 60.0  # between warnings that say the same
+
+
+class Throttle:
+    """Lets a line through, then holds back lines of the same cause for a while."""
+
+    def __init__(self, period_s: float = REPEAT_S) -> None:
+        self._period_s = period_s
+        self._last: dict[str, float] = {}
+        self._held: dict[str, int] = {}
+
+    def line(self, cause: str, text: str) -> str | None:
+        """The line to log, or None; says how many were held back."""
+        now = time.monotonic()
+        if now - self._last.get(cause, -1e9) < self._period_s:
+            self._held[cause] = self._held.get(cause, 0) + 1
+            return None
+        self._last[cause] = now
+        held = self._held.pop(cause, 0)
+        return f"{text} ({held} more like this since the last line)" if held else text
+
+
+@dataclass
+class Traffic:
+    """What has happened on one topic."""
+
+    received: int = 0
+    lost: int = 0  # by the middleware's own count
+    last_s: float = 0.0  # monotonic
+    incompatible: str = ""  # QoS policy that keeps a publisher from us
+    quiet: bool = False
+
+
+class Inputs:
+    """The two subscriptions; they exist while the node is active."""
+
+    def __init__(
+        self,
+        node: Node,
+        on_cloud: Callable[[PointCloud2], None],
+        on_joints: Callable[[JointState], None],
+    ) -> None:
+        self._node = node
+        self._callbacks = {"clouds": on_cloud, "joint_states": on_joints}
+        self._subscriptions: dict[str, Any] = {}
+        self.traffic = {"clouds": Traffic(), "joint_states": Traffic()}
+
+    def open(self, clouds: CloudInput, joints: JointInput) -> None:
+        """Subscribe."""
+        for name, kind, options in (
+            ("clouds", PointCloud2, clouds),
+            ("joint_states", JointState, joints),
+        ):
+            self.traffic[name] = Traffic(last_s=time.monotonic())
+            self._subscriptions[name] = self._node.create_subscription(
+                kind,
+                options.topic,
+                self._counted(name),
+                _qos(options),
+                event_callbacks=SubscriptionEventCallbacks(
+                    incompatible_qos=self._on_incompatible(name), message_lost=self._on_lost(name)
+                ),
+            )
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        for subscription in self._subscriptions.values():
+            self._node.destroy_subscription(subscription)
+        self._subscriptions.clear()
+
+    def check_quiet(self, limit_s: float) -> list[str]:
+        """Warnings for topics on which nothing has come for long; once for each time."""
+        lines: list[str] = []
+        for name, subscription in self._subscriptions.items():
+            traffic = self.traffic[name]
+            silence = time.monotonic() - traffic.last_s
+            if silence > limit_s and not traffic.quiet:
+                traffic.quiet = True
+                lines.append(self._quiet_line(name, subscription.topic_name, silence))
+        return lines
+
+    def statuses(self, limit_s: float) -> list[Status]:
+        """Diagnostics of each topic."""
+        return [
+            self._status(name, subscription.topic_name, limit_s)
+            for name, subscription in self._subscriptions.items()
+        ]
+
+    def _status(self, name: str, topic: str, limit_s: float) -> Status:
+        traffic = self.traffic[name]
+        silence = time.monotonic() - traffic.last_s
+        publishers = self._node.count_publishers(topic)
+        values = {
+            "topic": topic,
+            "publishers": publishers,
+            "received": traffic.received,
+            "lost in transport": traffic.lost,
+            "seconds since the last": f"{silence:.1f}",
+        }
+        part = name.replace("_", " ")
+        if traffic.incompatible and silence > limit_s:
+            return WARN, part, f"a publisher's QoS does not match ({traffic.incompatible})", values
+        if silence > limit_s:
+            return WARN, part, f"nothing for {silence:.0f} s, {publishers} publishers", values
+        return OK, part, "receiving" if traffic.received else "waiting", values
+
+    def _quiet_line(self, name: str, topic: str, silence: float) -> str:
+        what = "cloud" if name == "clouds" else "joint state"
+        publishers = self._node.count_publishers(topic)
+        if publishers == 0:
+            remedy = f"nobody publishes it; start the driver, remap, or set {name}.topic"
+        elif self.traffic[name].incompatible:
+            remedy = _qos_remedy(name, self.traffic[name].incompatible)
+        else:
+            remedy = (
+                f"{publishers} publish it; if they do send, large clouds may be lost in transport: "
+                "see docs/node.md, DDS"
+            )
+        return f"no {what} on {topic} for {silence:.0f} s: {remedy}"
+
+    def _counted(self, name: str) -> Callable[[Any], None]:
+        callback = self._callbacks[name]
+
+        def take(message: Any) -> None:
+            traffic = self.traffic[name]
+            traffic.received += 1
+            traffic.last_s = time.monotonic()
+            if traffic.quiet:
+                traffic.quiet = False
+                self._node.get_logger().info(f"{name.replace('_', ' ')} come again")
+            callback(message)
+
+        return take
+
+    def _on_incompatible(self, name: str) -> Callable[[Any], None]:
+        def note(event: Any) -> None:
+            policy = qos_policy_name_from_kind(event.last_policy_kind)
+            self.traffic[name].incompatible = policy
+            topic = self._subscriptions[name].topic_name if name in self._subscriptions else name
+            self._node.get_logger().warning(
+                f"a publisher of {topic} cannot reach this node: {_qos_remedy(name, policy)}"
+            )
+
+        return note
+
+    def _on_lost(self, name: str) -> Callable[[Any], None]:
+        def note(event: Any) -> None:
+            self.traffic[name].lost += event.total_count_change
+            self._node.get_logger().warning(
+                f"{name}: {event.total_count} messages lost in transport since the start; "
+                f"raise {name}.depth or see docs/node.md, DDS",
+                throttle_duration_sec=REPEAT_S,
+            )
+
+        return note
+
+
+def _qos_remedy(name: str, policy: str) -> str:
+    option = "durability" if "DURABILITY" in policy.upper() else "reliability"
+    other = "volatile" if option == "durability" else "best_effort"
+    remedy = f"set {name}.{option} to {other}, or change the publisher"
+    return f"its QoS does not match ({policy}); {remedy}"
+
+
+def _qos(options: CloudInput | JointInput) -> QoSProfile:
+    return QoSProfile(
+        depth=options.depth,
+        reliability=ReliabilityPolicy[options.reliability.upper()],
+        durability=DurabilityPolicy[options.durability.upper()],
+    )

@@ -1,0 +1,106 @@
+"""The lifecycle of the node: every request gets an answer, and a failure its reason."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from vflatten_ros.core.errors import VFlattenError
+
+ACTIVE = 3  # lifecycle_msgs/State.PRIMARY_STATE_ACTIVE
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+class AnsweringLifecycleNode(LifecycleNode):
+    """A lifecycle node that says no where rclpy's raises.
+
+    Subclasses do the work in `configure`, `activate`, `deactivate` and `cleanup`, and raise
+    VFlattenError where that fails.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.trouble = ""  # why the last transition failed
+        # rclpy lets an invalid request's RCLError out of spin: it would end the node, unanswered.
+        change_state = self._service_change_state.callback
+        self._service_change_state.callback = partial(self._answer_change_state, change_state)
+
+    def lifecycle_state(self) -> tuple[int, str]:
+        """Number (lifecycle_msgs/State) and name."""
+        number, label = self._state_machine.current_state
+        return int(number), str(label)
+
+    def autostart(self) -> None:
+        """Configure and activate, as a lifecycle manager would."""
+        if self.trigger_configure() == SUCCESS:
+            self.trigger_activate()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Check the categories and start the flattening process."""
+        return self._transition("configure", self.configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the calibration, begin an empty buffer and subscribe."""
+        return self._transition("activate", self.activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Unsubscribe and cancel what is being flattened."""
+        return self._transition("deactivate", self.deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """End the flattening process."""
+        return self._transition("clean up", self.cleanup)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As deactivate and cleanup."""
+        return self._transition("shut down", self._shut_down)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """After a mistake of our own: everything down, so that configure can try again."""
+        return self._transition("recover", self._shut_down)
+
+    def _transition(self, name: str, change: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            change()
+        except VFlattenError as error:
+            self.trouble = str(error)
+            self.get_logger().error(f"cannot {name}: {error}")
+            return FAILURE
+        except Exception:
+            self.trouble = f"internal error in {name}"
+            self.get_logger().error(f"internal error in {name}:\n{traceback.format_exc()}")
+            return TransitionCallbackReturn.ERROR
+        self.trouble = ""
+        return SUCCESS
+
+    def _shut_down(self) -> None:
+        self.deactivate()
+        self.cleanup()
+
+    def _answer_change_state(self, change: Callable[..., Any], request: Any, response: Any) -> Any:
+        try:
+            return change(request, response)
+        except rclpy_implementation.RCLError:
+            wanted = request.transition.label or f"transition {request.transition.id}"
+            self.get_logger().warning(
+                f"refused: {wanted} is not possible while {self.lifecycle_state()[1]}"
+            )
+            response.success = False
+            return response
+
+    def configure(self) -> None:
+        """Unconfigured to inactive."""
+
+    def activate(self) -> None:
+        """Inactive to active."""
+
+    def deactivate(self) -> None:
+        """Active to inactive; also called on the way down from any state."""
+
+    def cleanup(self) -> None:
+        """Inactive to unconfigured; also called on the way down from any state."""

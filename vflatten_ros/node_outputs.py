@@ -1,0 +1,127 @@
+"""What the node publishes: results that stay for late subscribers, the buffer, diagnostics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PolygonStamped
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Image, PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from vflatten_ros import displays, messages
+from vflatten_ros.goals import Goals
+from vflatten_ros.msg import FlattenedView, GarmentEstimate, ViewBufferState
+from vflatten_ros.parameters import OutputOptions
+from vflatten_ros.session import Session
+
+LATCHED = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+RESULTS = {
+    "flattened_view": FlattenedView,
+    "garment": GarmentEstimate,
+    "contour": PolygonStamped,
+    "markers": MarkerArray,
+    "image": Image,
+    "points": PointCloud2,
+}
+OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
+Status = tuple[int, str, str, Mapping[str, Any]]  # level, part, message, values
+
+
+class Outputs:
+    """Publishers of the node."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._results = {
+            name: node.create_publisher(kind, f"~/{name}", LATCHED)
+            for name, kind in RESULTS.items()
+        }
+        self._buffer = node.create_publisher(ViewBufferState, "~/views", LATCHED)
+        self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._hardware_id = node.get_fully_qualified_name()
+
+    def publish_result(self, serialized: Mapping[str, bytes], options: OutputOptions) -> None:
+        """Publish messages that the worker has serialized."""
+        for name, publisher in self._results.items():
+            if name in serialized and getattr(options, name, True):
+                publisher.publish(serialized[name])
+
+    def publish_buffer(self, state: ViewBufferState) -> None:
+        """Publish what has been gathered."""
+        self._buffer.publish(state)
+
+    def publish_diagnostics(self, statuses: list[Status]) -> None:
+        """Publish one status for every part of the node."""
+        name = self._node.get_name()
+        rows = [
+            (level, f"{name}: {part}", text, self._hardware_id, values)
+            for level, part, text, values in statuses
+        ]
+        stamp = self._node.get_clock().now().nanoseconds
+        fields = displays.diagnostic_fields(stamp, rows)
+        self._diagnostics.publish(messages.fill(DiagnosticArray(), fields))
+
+
+def result_message(name: str, serialized: Mapping[str, bytes]) -> Any:
+    """A message of the result as an object."""
+    return deserialize_message(serialized[name], RESULTS[name])
+
+
+def buffer_message(session: Session | None) -> ViewBufferState:
+    """The state of the buffer; empty before the node was active."""
+    if session is None:
+        return ViewBufferState()
+    fields = messages.view_buffer_state_fields(
+        session.buffer.state(),
+        session.buffer.views(),
+        session.calibration.frame,
+        selected=session.selected(),
+        correspondences=len(session.pairs),
+    )
+    return messages.fill(ViewBufferState(), fields)
+
+
+def buffer_status(session: Session) -> Status:
+    """Diagnostics of the buffer: counts by reason."""
+    state = session.buffer.state()
+    values = {
+        "item": state.item,
+        "views": len(state.view_ids),
+        "angle covered, deg": f"{state.angle_covered_rad * 57.29578:.0f}",
+        "megabytes": f"{state.nbytes / 1e6:.1f}",
+        "correspondences": len(session.pairs),
+        "clouds received": state.clouds_received,
+        "clouds waiting": state.clouds_waiting,
+        "clock jumps": state.clock_jumps,
+        **{f"dropped: {reason}": count for reason, count in state.drops.items()},
+    }
+    lost = sum(state.drops.values())
+    text = f"{state.stage.name.lower()}, {len(state.view_ids)} views, {lost} clouds dropped"
+    only_drops = lost > 0 and not state.view_ids
+    return (WARN if only_drops else OK), "buffer", text, values
+
+
+def flattening_status(goals: Goals | None, finished: int, failed: int, last: str) -> Status:
+    """Diagnostics of the flattening process."""
+    if goals is None:
+        return OK, "flattening", "not configured", {}
+    values = {
+        "done": finished,
+        "failed": failed,
+        "waiting": goals.waiting,
+        "process restarts": goals.restarts,
+        "last": last,
+    }
+    if not goals.ready:
+        return WARN, "flattening", "the process is starting", values
+    text = f"{goals.stage} {goals.fraction:.0%}" if goals.busy else "idle"
+    return OK, "flattening", text, values

@@ -1,0 +1,263 @@
+"""The process that flattens, so that the node's callbacks never wait for the method.
+
+Views are sent as they arrive; a job names those it wants by key. A process, not a thread: the
+method holds Python's interpreter lock in bursts, and a process can be ended when it does not stop.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Any
+
+from vflatten_ros.core.config import Config
+from vflatten_ros.core.errors import Cancelled, VFlattenError
+from vflatten_ros.core.values import Correspondence, FlatGarment, Progress, View
+
+PROGRESS_PERIOD_S = 0.05
+
+
+@dataclass(frozen=True)
+class Job:
+    """One flattening."""
+
+    number: int
+    view_keys: tuple[int, ...]
+    correspondences: tuple[Correspondence, ...]
+    config: Config
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far a job is."""
+
+    number: int
+    stage: str
+    fraction: float  # of the stage
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended: with a garment, or with an error."""
+
+    number: int
+    garment: FlatGarment | None = None
+    messages: Mapping[str, bytes] = field(default_factory=dict)  # topic -> serialized message
+    seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> wall time
+    error: str = ""
+    cancelled: bool = False
+
+
+@dataclass(frozen=True)
+class Ready:
+    """The process has loaded everything and waits for jobs."""
+
+
+@dataclass(frozen=True)
+class Died:
+    """The process is gone."""
+
+    exit_code: int | None
+
+
+Event = Step | Outcome | Ready | Died
+Work = Callable[[Sequence[View], Job, Progress], tuple[FlatGarment, Mapping[str, bytes]]]
+Prepare = Callable[[], Work]
+
+
+class Worker:
+    """Handle of the process. Not thread-safe; `notify` is called from another thread.
+
+    Parameters
+    ----------
+    prepare : callable
+        Called once in the process; gives the function that does a job. Must be importable.
+    notify : callable
+        Called when `events` has something.
+    nice : int
+        Added to the process's nice value.
+    """
+
+    def __init__(self, prepare: Prepare, notify: Callable[[], None], nice: int = 0) -> None:
+        self._prepare, self._notify, self._nice = prepare, notify, nice
+        self._events: queue.SimpleQueue[tuple[int, Event]] = queue.SimpleQueue()
+        self._keys: dict[View, int] = {}
+        self._next_key = 0
+        self._generation = 0
+        self._start()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id."""
+        return self._process.pid
+
+    def keep(self, views: Sequence[View]) -> None:
+        """Send the views that the process does not have, and let it forget all others."""
+        wanted = set(views)
+        for view in [view for view in self._keys if view not in wanted]:
+            self._outbox.put(("forget", self._keys.pop(view)))
+        for view in views:
+            if view not in self._keys:
+                self._keys[view] = self._next_key
+                self._outbox.put(("view", self._next_key, view))
+                self._next_key += 1
+
+    def submit(
+        self, number: int, views: Sequence[View], pairs: Sequence[Correspondence], config: Config
+    ) -> None:
+        """Begin a job on views that were kept before."""
+        keys = tuple(self._keys[view] for view in views)
+        self._outbox.put(("job", Job(number, keys, tuple(pairs), config)))
+
+    def cancel(self, number: int) -> None:
+        """Ask a job to stop; its outcome says that it was cancelled."""
+        self._outbox.put(("cancel", number))
+
+    def events(self) -> Iterator[Event]:
+        """What has happened since the last call."""
+        while not self._events.empty():
+            generation, event = self._events.get()
+            if generation == self._generation:
+                yield event
+
+    def restart(self) -> None:
+        """End the process as it is and begin a new one, which gets the kept views again."""
+        self.stop()
+        self._start()
+        for view, key in self._keys.items():
+            self._outbox.put(("view", key, view))
+
+    def stop(self) -> None:
+        """End the process."""
+        self._generation += 1
+        self._outbox.put(None)
+        self._process.kill()
+        self._process.join(timeout=5.0)
+
+    def _start(self) -> None:
+        context = get_context("spawn")
+        ours, theirs = context.Pipe()
+        self._process = context.Process(
+            target=serve, args=(theirs, self._prepare, self._nice), daemon=True, name="flatten"
+        )
+        self._process.start()
+        theirs.close()
+        self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        for run in (self._write, self._read):
+            args = (ours, self._process, self._outbox, self._generation)
+            threading.Thread(target=run, args=args, daemon=True).start()
+
+    def _write(self, pipe: Connection, _: Any, outbox: queue.SimpleQueue[Any], __: int) -> None:
+        for message in iter(outbox.get, None):
+            try:
+                pipe.send(message)
+            except OSError:
+                return
+
+    def _read(self, pipe: Connection, process: Any, outbox: Any, generation: int) -> None:
+        while True:
+            try:
+                event = pipe.recv()
+            except (EOFError, OSError):
+                process.join(timeout=1.0)
+                event = Died(process.exitcode)
+            if generation != self._generation:
+                return  # stopped meanwhile: nobody wants to know
+            self._events.put((generation, event))
+            self._notify()
+            if isinstance(event, Died):
+                outbox.put(None)
+                return
+
+
+def serve(pipe: Connection, prepare: Prepare, nice: int) -> None:
+    """What the process runs: take jobs until the other end is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the group; the node decides
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    os.nice(nice)
+    inbox = _Inbox(pipe)
+    threading.Thread(target=inbox.receive, daemon=True).start()
+    work = prepare()
+    pipe.send(Ready())
+    while True:
+        job, views = inbox.jobs.get()
+        pipe.send(_outcome(work, job, views, _Reporter(pipe, job, inbox)))
+
+
+class _Inbox:
+    """Messages of the node, taken by a thread so that a cancel is seen during a job."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self.jobs: queue.SimpleQueue[tuple[Job, list[View]]] = queue.SimpleQueue()
+        self.cancelled: set[int] = set()
+        self._pipe = pipe
+        self._views: dict[int, View] = {}
+
+    def receive(self) -> None:
+        try:
+            self._receive()
+        except (EOFError, OSError):
+            os._exit(0)  # the node is gone, whatever is being computed is for nobody
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)  # the node starts another
+
+    def _receive(self) -> None:
+        while True:
+            kind, *rest = self._pipe.recv()
+            if kind == "view":
+                self._views[rest[0]] = rest[1]
+            elif kind == "forget":
+                self._views.pop(rest[0], None)
+            elif kind == "cancel":
+                self.cancelled.add(rest[0])
+            else:
+                self.jobs.put((rest[0], [self._views[key] for key in rest[0].view_keys]))
+
+
+class _Reporter:
+    """The progress callback of a job: reports, times the stages, raises Cancelled."""
+
+    def __init__(self, pipe: Connection, job: Job, inbox: _Inbox) -> None:
+        self._pipe, self._number, self._inbox = pipe, job.number, inbox
+        self._stage, self._since, self._reported = "", time.perf_counter(), 0.0
+        self.seconds: dict[str, float] = {}
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        if self._number in self._inbox.cancelled:
+            raise Cancelled("the caller asked to stop")
+        now = time.perf_counter()
+        if stage != self._stage:
+            self.close(now)
+            self._stage, self._reported = stage, 0.0
+        if now - self._reported >= PROGRESS_PERIOD_S:
+            self._reported = now
+            self._pipe.send(Step(self._number, stage, fraction))
+
+    def close(self, now: float) -> None:
+        if self._stage:
+            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+        self._since = now
+
+
+def _outcome(work: Work, job: Job, views: list[View], report: _Reporter) -> Outcome:
+    try:
+        report("start", 0.0)
+        garment, messages = work(views, job, report)
+        report.close(time.perf_counter())
+        return Outcome(job.number, garment, messages, report.seconds)
+    except Cancelled as error:
+        return Outcome(job.number, error=str(error), cancelled=True)
+    except VFlattenError as error:
+        return Outcome(job.number, error=str(error))
+    except Exception:  # our own mistake must not take the process with it
+        trace = traceback.format_exc()
+        return Outcome(job.number, error=f"internal error, please report it:\n{trace}")

@@ -5,7 +5,6 @@ The bytes depend on the messages alone: log times are the messages' own stamps.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from mcap_ros2.writer import Writer
 from vflatten_ros import displays, messages, resources
 from vflatten_ros.core.values import FlatGarment, View
 from vflatten_ros.messages import Fields
+from vflatten_ros.output_files import whole_file
 from vflatten_ros.picture import draw_flat
 
 _BUILT_IN = re.compile(r"(bool|byte|char|w?string|u?int(8|16|32|64)|float(32|64))(<=\d+)?")
@@ -127,15 +127,8 @@ def _parts(package: str, text: str) -> Iterator[str]:
 
 
 def write_mcap(path: Path, to_write: Iterable[Message]) -> None:
-    """Write messages to a file; a reader never sees half of it.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
-    partial = path.with_name(path.name + ".part")
-    with partial.open("wb") as stream:
+    """Write messages to a file; raises OSError."""
+    with whole_file(path) as partial, partial.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD)
         schemas: dict[str, Any] = {}
         for message in to_write:
@@ -152,7 +145,6 @@ def write_mcap(path: Path, to_write: Iterable[Message]) -> None:
                 publish_time=message.stamp_ns,
             )
         writer.finish()
-    os.replace(partial, path)
 
 
 def _plain(value: Any) -> Any:

@@ -240,6 +240,11 @@ def correspondence_from_fields(
     return Correspondence(ids[0], ids[1], pixel_a, pixel_b, manual, confidence)
 
 
+def checked_correspondence(pair: Correspondence, views: Mapping[int, View]) -> Correspondence:
+    """The pair as the service would take it; raises InvalidCorrespondence as it would."""
+    return correspondence_from_fields(correspondence_fields(pair, 0), views)
+
+
 def _side(
     fields: Mapping[str, Any], side: str, views: Mapping[int, View], view_id: int
 ) -> tuple[int, int]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from vflatten_ros.messages import (
     garment_estimate_fields,
     stamp_ns,
 )
+from vflatten_ros.output_files import whole_file
 
 Result = dict[str, Any]
 
@@ -154,7 +154,6 @@ def _finite(value: Any) -> Any:
 
 
 def write_json(path: Path, result: Mapping[str, Any]) -> None:
-    """Write the object; a reader never sees half a file."""
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(json_text(result), encoding="utf-8")
-    os.replace(partial, path)
+    """Write the object; raises OSError."""
+    with whole_file(path) as partial:
+        partial.write_text(json_text(result), encoding="utf-8")

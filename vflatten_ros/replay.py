@@ -1,0 +1,166 @@
+"""From a file to a flattened garment: what `vflatten replay` and `vflatten flatten` do."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from vflatten_ros.bag import Recording, gather_views, open_recording
+from vflatten_ros.categories import load_templates
+from vflatten_ros.cloud_files import cloud_to_view, load_cloud_file
+from vflatten_ros.core.config import Config
+from vflatten_ros.core.errors import EmptyView, InvalidCloud, InvalidCorrespondence, NotEnoughViews
+from vflatten_ros.core.pipeline import flatten_garment
+from vflatten_ros.core.templates import Template
+from vflatten_ros.core.values import Correspondence, FlatGarment, Progress, View, no_progress
+from vflatten_ros.files import calibration_beside, load_calibration, load_protocol
+from vflatten_ros.messages import checked_correspondence
+
+FEWEST_PAIRS = 2  # that fix one view's place in the plane of the other
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """A flattened garment and where it came from."""
+
+    garment: FlatGarment
+    views: tuple[View, ...]  # that the method was given
+    templates: tuple[Template, ...]
+    source: str
+    clouds: int
+    drops: Mapping[str, int]  # reason -> clouds that gave no view
+    warnings: tuple[str, ...] = field(default=())  # what went wrong, and could be worked round
+    notes: tuple[str, ...] = field(default=())  # what was chosen
+
+
+def replay_recording(
+    path: Path,
+    config: Config,
+    *,
+    calibration: Path | None = None,
+    protocol: Path | None = None,
+    view_ids: Sequence[int] = (),
+    cloud_topic: str | None = None,
+    joint_topic: str | None = None,
+    progress: Progress = no_progress,
+) -> Replayed:
+    """Flatten the item of a recorded rotation.
+
+    Parameters
+    ----------
+    path : Path
+        rosbag2 folder or .mcap file.
+    config : Config
+    calibration : Path, optional
+        By default calibration.yaml beside the recording.
+    protocol : Path, optional
+        Views and corresponding points that a person chose.
+    view_ids : sequence of int
+        Use these views only; the protocol's, or all, if empty.
+    cloud_topic, joint_topic : str, optional
+        Where the recording has several of the type.
+    progress : Progress
+
+    Raises
+    ------
+    VFlattenError
+        Says what came, what was expected, what to try.
+    """
+    progress("open", 0.0)
+    templates = load_templates()
+    rig = load_calibration(calibration or calibration_beside(path))
+    chosen, pairs = load_protocol(protocol) if protocol else ((), ())
+    wanted = tuple(view_ids) or chosen
+    recording = open_recording(path, cloud_topic, joint_topic)
+    buffer = gather_views(recording, rig, _keeping_all(config) if wanted else config, progress)
+    state = buffer.state()
+    views = _select(buffer.views(), wanted, recording)
+    kept, warnings = _check_pairs(pairs, views, FEWEST_PAIRS if protocol else 0)
+    garment = flatten_garment(views, kept, templates, config, progress)
+    return Replayed(
+        garment=garment,
+        views=views,
+        templates=templates,
+        source=str(path),
+        clouds=state.clouds_received,
+        drops=state.drops,
+        warnings=(*recording.warnings, *warnings),
+        notes=recording.guessed,
+    )
+
+
+def flatten_file(
+    path: Path,
+    config: Config,
+    *,
+    up: Sequence[float],
+    crop: Sequence[float] | None = None,
+    progress: Progress = no_progress,
+) -> Replayed:
+    """Flatten what one cloud shows, without a robot.
+
+    Parameters
+    ----------
+    path : Path
+        .ply, .npy or .npz.
+    config : Config
+    up : three numbers
+        Upwards in the cloud's frame.
+    crop : six numbers, optional
+        Least x, y, z, then greatest x, y, z of the item, m.
+    progress : Progress
+
+    Raises
+    ------
+    VFlattenError
+        Says what came, what was expected, what to try.
+    """
+    progress("open", 0.0)
+    templates = load_templates()
+    cloud = load_cloud_file(path)
+    try:
+        view = cloud_to_view(cloud, up, crop, config.segmentation)
+    except (EmptyView, InvalidCloud) as error:
+        raise type(error)(f"{path}: {error}") from error
+    garment = flatten_garment((view,), (), templates, config, progress)
+    return Replayed(garment, (view,), templates, str(path), clouds=1, drops={})
+
+
+def _keeping_all(config: Config) -> Config:
+    """Views that are asked for by id do not give way to others at the same angle."""
+    buffer = dataclasses.replace(config.buffer, duplicate_angle_deg=0.0)
+    return dataclasses.replace(config, buffer=buffer)
+
+
+def _select(views: Sequence[View], wanted: Sequence[int], recording: Recording) -> tuple[View, ...]:
+    by_id = {view.view_id: view for view in views}
+    missing = [i for i in wanted if i not in by_id]
+    if missing:
+        known = ", ".join(str(i) for i in by_id)
+        raise NotEnoughViews(
+            f"{recording.path}: cloud {missing[0]} gave no view; there are views {known}"
+        )
+    return tuple(by_id[i] for i in wanted) if wanted else tuple(views)
+
+
+def _check_pairs(
+    pairs: Sequence[Correspondence], views: Sequence[View], fewest: int
+) -> tuple[tuple[Correspondence, ...], tuple[str, ...]]:
+    """Corresponding points that lie on the item, and why the others do not."""
+    by_id = {view.view_id: view for view in views}
+    kept: list[Correspondence] = []
+    refused: list[str] = []
+    for number, pair in enumerate(pairs):
+        try:
+            kept.append(checked_correspondence(pair, by_id))
+        except InvalidCorrespondence as error:
+            refused.append(f"corresponding point {number} left out: {error}")
+    if len(kept) < fewest:
+        reasons = "; ".join(refused) or "give more pairs"
+        raise InvalidCorrespondence(
+            f"{len(kept)} of {len(pairs)} corresponding points are usable, "
+            f"at least {fewest} are needed; {reasons}"
+        )
+    return tuple(kept), tuple(refused)

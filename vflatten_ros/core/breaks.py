@@ -25,14 +25,13 @@ class Layers:
     seen: Bool  # (rows, cols) measured
     valid: Bool  # (rows, cols) measured, in a small hole, or within RING of the border
     source: Int  # (rows, cols) flat index of the nearest measured place
+    bridged: Bool  # (rows, cols) in a hole too large to trust: the surface is only guessed
     right: Bool  # (rows, cols) joined to the place to the right
     down: Bool  # (rows, cols) joined to the place below
     label: NDArray[np.int32]  # (rows, cols) number of the piece, -1: none
 
 
-def find_layers(
-    depth: Float, seen: Bool, points: Float, cell_m: float, noise_m: float
-) -> Layers:
+def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m: float) -> Layers:
     """Join grid neighbours that no depth jump separates.
 
     Parameters
@@ -51,18 +50,20 @@ def find_layers(
     away, nearest = distance_transform_edt(~seen, return_indices=True)
     source = nearest[0] * seen.shape[1] + nearest[1]
     holes, _ = connected_regions(~seen)
-    small = np.bincount(holes.ravel())[holes] <= HOLE
-    small &= ~seen
-    valid = (away <= RING) | small
+    small = (np.bincount(holes.ravel())[holes] <= HOLE) & ~seen
+    outside = np.unique(np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]]))
+    bridged = ~seen & ~small & (away > RING) & ~np.isin(holes, outside)
+    valid = (away <= RING) | small | bridged
     across = np.where(small, 8.0, 3.0)
     joined = []
     for axis in (1, 0):
         join = _joined(depth, seen, points, source, across, axis, cell_m, noise_m)
+        join |= bridged | np.roll(bridged, -1, axis=axis)
         join &= valid & np.roll(valid, -1, axis=axis)
         join[(slice(None), -1) if axis else -1] = False
         joined.append(join)
     right, down = joined
-    return Layers(seen, valid, source, right, down, _label(valid, right, down))
+    return Layers(seen, valid, source, bridged, right, down, _label(valid, right, down))
 
 
 def _joined(

@@ -68,17 +68,20 @@ def geodesic_lines(
         raise InvalidInput(f"starts and ends differ in number: {len(starts)} and {len(ends)}")
     if not len(starts):
         none = np.zeros(0)
-        return Geodesics(np.zeros((0, config.nodes, 3)), none, none, none > 0, none.astype(np.uint8))
+        return Geodesics(
+            np.zeros((0, config.nodes, 3)), none, none, none > 0, none.astype(np.uint8)
+        )
     a, b = surface.rays.to_grid(starts)[0], surface.rays.to_grid(ends)[0]
     path, apart = _first_guess(surface, a, b, config.nodes)
     progress("geodesics", 0.3)
     if config.solver == "springs":
         nodes, held, converged = relax_springs(surface, path, progress)
-        lines = _describe(surface, surface.rays.to_grid(nodes)[0], held, converged, apart)
+        lines = _describe(surface, surface.rays.to_grid(nodes)[0], held, converged)
         length = np.linalg.norm(np.diff(nodes, axis=1), axis=2).sum(axis=1)
         return replace(lines, nodes=nodes, length_m=length)
-    path, held, converged = relax_newton(surface, path, progress)
-    return _describe(surface, path, held, converged, apart)
+    held, converged = np.zeros(path.shape[:2], bool), np.ones(len(path), bool)
+    path[~apart], held[~apart], converged[~apart] = relax_newton(surface, path[~apart], progress)
+    return _describe(surface, path, held, converged)
 
 
 def _first_guess(surface: Surface, a: Float, b: Float, nodes: int) -> tuple[Float, Bool]:
@@ -193,31 +196,60 @@ def _newton_step(points: Float, tangents: Float, held: Bool) -> Float:
     return solved.reshape(m, n - 2, 2)
 
 
-def _describe(surface: Surface, path: Float, held: Bool, converged: Bool, apart: Bool) -> Geodesics:
+def _describe(surface: Surface, path: Float, held: Bool, converged: Bool) -> Geodesics:
     """Lengths, standard deviations and reasons of relaxed lines."""
     dense = _dense(path, FINE)
-    points, tangents = _points(surface, dense)
-    del tangents
+    points, _ = _points(surface, dense)
     segment = np.linalg.norm(np.diff(points, axis=1), axis=2)
     coarse = np.linalg.norm(np.diff(points[:, ::2], axis=1), axis=2)
     # chords are short by a multiple of their squared length: extrapolate (Richardson 1911)
     length = (4 * segment.sum(axis=1) - coarse.sum(axis=1)) / 3
-    closed = ~_open(surface, path)
-    reason = np.select(
-        [apart | closed, held.any(axis=1), ~converged],
-        [np.where(_is_jump(surface, path), JUMP, MISSING), BENT, NOT_CONVERGED],
-        OK,
-    ).astype(np.uint8)
     sigma = np.hypot(_end_sigma(surface, dense, points), 5e-4 * length)
-    sigma = np.hypot(sigma, np.where(reason == OK, 0.0, 0.05 * length))
-    return Geodesics(points[:, ::FINE], length, sigma, reason != OK, reason)
+    apart = np.linalg.norm(points[:, -1] - points[:, 0], axis=1)
+    gap, bridge, jumps = _gaps(surface, dense, points, segment)
+    broken = gap > 0
+    length = np.where(broken, segment.sum(axis=1) - gap + bridge, length)
+    bent = held.any(axis=1) & ~broken
+    reason = np.select(
+        [broken & jumps, broken, bent, ~converged], [JUMP, MISSING, BENT, NOT_CONVERGED], OK
+    ).astype(np.uint8)
+    doubt = np.select(
+        [broken & jumps, broken, bent, ~converged],
+        # cloth behind a jump may be much longer than the way across; a hole is likely smooth;
+        # a flat distance lies between the distance in space and the length round the border
+        [0.5 * bridge + 0.05 * length, 0.15 * bridge, (length - apart) / 3, 0.01 * length],
+        0.0,
+    )
+    return Geodesics(points[:, ::FINE], length, np.hypot(sigma, doubt), reason != OK, reason)
 
 
-def _is_jump(surface: Surface, path: Float) -> Bool:
-    """(m,) whether depth jumps where a line is not on one piece."""
-    points, _ = _points(surface, _dense(path, FINE))
-    step = np.linalg.norm(np.diff(points, axis=1), axis=2)
-    return np.asarray(step.max(axis=1) > 6 * np.median(step, axis=1))
+def _gaps(
+    surface: Surface, dense: Float, points: Float, segment: Float
+) -> tuple[Float, Float, Bool]:
+    """Of each line: length between first and last break, distance across, and whether depth jumps."""
+    layers = surface.layers
+    place = np.clip(np.round(dense).astype(int), 0, np.array(layers.valid.shape) - 1)
+    guessed = layers.bridged[place[..., 0], place[..., 1]]
+    tight = _dense(dense, 2)
+    whole = joined_places(layers, tight)[1]
+    broken = ~whole.reshape(len(dense), -1, 2).all(axis=2)
+    hole = guessed[:, :-1] | guessed[:, 1:]
+    bad = broken | hole
+    count = bad.shape[1]
+    first = np.argmax(bad, axis=1)
+    last = count - np.argmax(bad[:, ::-1], axis=1)
+    k = np.arange(count)
+    between = (k >= first[:, None]) & (k < last[:, None]) & bad.any(axis=1)[:, None]
+    row = np.arange(len(dense))
+    chord = np.linalg.norm(points[row, last] - points[row, first], axis=1)
+    gap = (segment * between).sum(axis=1)
+    # on a guessed surface without a break the way along it beats the chord
+    smooth = ~broken.any(axis=1)
+    bridge = np.where(smooth, gap, chord)
+    depth = surface.rays.to_grid(points)[1]
+    step = np.abs(np.diff(depth, axis=1)).max(axis=1)
+    jumps = broken.any(axis=1) & (step > 3.0 * surface.spacing_m)
+    return gap, np.where(gap > 0, bridge, 0.0), jumps
 
 
 def _end_sigma(surface: Surface, dense: Float, points: Float) -> Float:

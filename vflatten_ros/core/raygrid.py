@@ -124,5 +124,12 @@ def camera_rays(points: Float, pixel: NDArray[np.int32], shape: tuple[int, int])
     inverse = np.linalg.inv(matrix[:, :3])
     zero = np.zeros(3)
     return RayGrid(
-        -inverse @ matrix[:, 3], zero, zero, inverse[:, 2], inverse[:, 0], inverse[:, 1], matrix, shape
+        -inverse @ matrix[:, 3],
+        zero,
+        zero,
+        inverse[:, 2],
+        inverse[:, 0],
+        inverse[:, 1],
+        matrix,
+        shape,
     )

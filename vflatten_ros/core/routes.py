@@ -54,7 +54,9 @@ def find_routes(
     routes = np.empty((len(starts), nodes, 2))
     for k in range(len(starts)):
         middle = _walk(before[which[k]], int(last[k])) if np.isfinite(length[k]) else []
-        corners = np.concatenate([starts[k : k + 1], place[middle[1:-1]].reshape(-1, 2), ends[k : k + 1]])
+        corners = np.concatenate(
+            [starts[k : k + 1], place[middle[1:-1]].reshape(-1, 2), ends[k : k + 1]]
+        )
         routes[k] = _even(corners, nodes)
     return routes, length
 

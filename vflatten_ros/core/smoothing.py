@@ -8,11 +8,19 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import correlate1d
+from scipy.sparse import csr_matrix, identity, vstack
+from scipy.sparse.linalg import spsolve
 
 from vflatten_ros.core.geometry import Float
 from vflatten_ros.core.raygrid import RayGrid
 from vflatten_ros.core.values import Bool
 
+# second differences by row, by column and mixed (twice in the bending energy)
+BENDING = (
+    (((-1, 0), (0, 0), (1, 0)), (1.0, -2.0, 1.0)),
+    (((0, -1), (0, 0), (0, 1)), (1.0, -2.0, 1.0)),
+    (((0, 0), (0, 1), (1, 0), (1, 1)), (1.41421, -1.41421, -1.41421, 1.41421)),
+)
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
 
@@ -72,6 +80,59 @@ def quadratic_image(depth: Float, seen: Bool, where: Bool, width: float) -> tupl
     fits, gain = np.zeros((*seen.shape, 6)), np.zeros(seen.shape)
     fits[pick], gain[pick] = solved, variance
     return fits, gain
+
+
+def fill_holes(fits: Float, known: Bool, holes: Bool) -> Float:
+    """Fits in large holes: the surface of least bending that continues what is known around."""
+    if not holes.any():
+        return fits
+    image = np.where(known, fits[..., 0], 0.0)
+    level = image[known].mean()
+    number = np.full(holes.shape, -1)
+    number[holes] = np.arange(holes.sum())
+    bending = []
+    right = []
+    flat, given, index = image.ravel() - level, known.ravel(), number.ravel()
+    for steps, factors in BENDING:
+        offset = np.array(steps) @ (holes.shape[1], 1)
+        low, high = np.min(steps, axis=0), np.max(steps, axis=0)
+        r, c = np.indices(holes.shape).reshape(2, -1)
+        fits_in = (r + low[0] >= 0) & (r + high[0] < holes.shape[0])
+        fits_in &= (c + low[1] >= 0) & (c + high[1] < holes.shape[1])
+        at = np.flatnonzero(fits_in)[:, None] + offset
+        use = (index[at] >= 0).any(axis=1) & ((index[at] >= 0) | given[at]).all(axis=1)
+        at = at[use]
+        free = index[at] >= 0
+        row = np.broadcast_to(np.arange(len(at))[:, None], at.shape)
+        weights = np.broadcast_to(np.array(factors), at.shape)
+        shape = (len(at), int(holes.sum()))
+        bending.append(csr_matrix((weights[free], (row[free], index[at][free])), shape=shape))
+        right.append(-(weights * np.where(free, 0.0, flat[at])).sum(axis=1))
+    a, b = vstack(bending), np.concatenate(right)
+    hold = 1e-9 * identity(a.shape[1])
+    image[holes] = level + spsolve((a.T @ a + hold).tocsc(), a.T @ b)
+    return _differences(fits, image, holes)
+
+
+def _differences(fits: Float, image: Float, where: Bool) -> Float:
+    """Fits from the differences of neighbouring depths."""
+    out = fits.copy()
+    r, c = np.nonzero(where)
+    z = image[r, c]
+    up, down, left, right = image[r - 1, c], image[r + 1, c], image[r, c - 1], image[r, c + 1]
+    mixed = image[r + 1, c + 1] - image[r + 1, c - 1] - image[r - 1, c + 1] + image[r - 1, c - 1]
+    out[r, c] = np.stack(
+        [
+            z,
+            (down - up) / 2,
+            (right - left) / 2,
+            (up + down) / 2 - z,
+            mixed / 4,
+            (left + right) / 2 - z,
+        ],
+        axis=1,
+    )
+    return out
 
 
 def _moments(values: Float, kernels: list[Float], order: int) -> dict[tuple[int, int], Float]:
@@ -160,7 +221,13 @@ def _principal_axes(away: Float, weight: Float) -> Float:
 
 
 def _to_rays(
-    rays: RayGrid, rc: Float, centre: Float, axes: Float, surface: Float, width_m: float, gain: Float
+    rays: RayGrid,
+    rc: Float,
+    centre: Float,
+    axes: Float,
+    surface: Float,
+    width_m: float,
+    gain: Float,
 ) -> tuple[Float, Float, Bool]:
     """Fits as depth along the rays, by implicit differentiation of w - f(u, v) = 0."""
     depth = rays.to_grid(centre)[1]
@@ -188,7 +255,13 @@ def _to_rays(
 
 
 def _implicit(
-    rays: RayGrid, rc: Float, depth: Float, centre: Float, axes: Float, surface: Float, width_m: float
+    rays: RayGrid,
+    rc: Float,
+    depth: Float,
+    centre: Float,
+    axes: Float,
+    surface: Float,
+    width_m: float,
 ) -> tuple[Float, Float, Float]:
     """Gradient (k, 3) and Hessian (k, 3, 3) of w - f(u, v) by (row, col, depth), its value."""
     ray = rays.rays(rc)

@@ -14,7 +14,14 @@ from vflatten_ros.core.breaks import Layers, connected_window, find_layers
 from vflatten_ros.core.config import SurfaceConfig
 from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.raygrid import RayGrid, camera_rays, parallel_rays
-from vflatten_ros.core.smoothing import plane_fits, quadratic_image, slope_at, tangent_fits, value_at
+from vflatten_ros.core.smoothing import (
+    fill_holes,
+    plane_fits,
+    quadratic_image,
+    slope_at,
+    tangent_fits,
+    value_at,
+)
 from vflatten_ros.core.weighted_planes import linear_fit, view_frame
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
@@ -93,8 +100,11 @@ def fit_surface(
         fits = _linear_fits(points, toward, rays, layers, measured, fits, cell, config.radius_m)
     else:
         _refit(rays, layers, measured, special, width * cell, fits, gain)
+    fits = fill_holes(fits, layers.valid & ~layers.bridged, layers.bridged)
     progress("surface", 0.9)
-    return _assemble(points, toward, rays, rc, fits, layers, noise * np.sqrt(gain), noise, cell, config)
+    return _assemble(
+        points, toward, rays, rc, fits, layers, noise * np.sqrt(gain), noise, cell, config
+    )
 
 
 def _assemble(
@@ -120,11 +130,17 @@ def _special(layers: Layers, fits: Float, cell: float, reach: int) -> Bool:
     cut[:, :-1] |= layers.valid[:, :-1] & layers.valid[:, 1:] & ~layers.right[:, :-1]
     cut[:-1] |= layers.valid[:-1] & layers.valid[1:] & ~layers.down[:-1]
     steep = np.hypot(fits[..., 1], fits[..., 2]) > 1.2 * cell
-    return np.asarray(layers.valid & (maximum_filter(cut, 2 * reach + 1) | steep))
+    return np.asarray(layers.valid & ~layers.bridged & (maximum_filter(cut, 2 * reach + 1) | steep))
 
 
 def _refit(
-    rays: RayGrid, layers: Layers, measured: Float, special: Bool, width_m: float, fits: Float, gain: Float
+    rays: RayGrid,
+    layers: Layers,
+    measured: Float,
+    special: Bool,
+    width_m: float,
+    fits: Float,
+    gain: Float,
 ) -> None:
     """Replace fits and gain at special places by fits in the local tangent frame."""
     rows, cols = np.nonzero(special)
@@ -139,7 +155,12 @@ def _refit(
         window = pad[at].reshape(len(r), -1, 3)
         source = measured.reshape(-1, 3)[layers.source[r, c]]
         fit, variance, good = tangent_fits(
-            rays, np.stack([r, c], axis=1).astype(float), window, near.reshape(len(r), -1), source, width_m
+            rays,
+            np.stack([r, c], axis=1).astype(float),
+            window,
+            near.reshape(len(r), -1),
+            source,
+            width_m,
         )
         fits[r[good], c[good]] = fit[good]
         gain[r[good], c[good]] = variance[good]
@@ -258,7 +279,9 @@ def depth_at(surface: Surface, rc: Float) -> tuple[Float, Float, Bool]:
     d_top, d_mass = np.zeros((len(rc), 2)), np.zeros((len(rc), 2))
     for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
         w = by_row[i] * by_col[j] * joined[k]
-        dw = np.stack([(2 * i - 1) * rate[:, 0] * by_col[j], (2 * j - 1) * rate[:, 1] * by_row[i]], 1)
+        dw = np.stack(
+            [(2 * i - 1) * rate[:, 0] * by_col[j], (2 * j - 1) * rate[:, 1] * by_row[i]], 1
+        )
         dw *= joined[k][:, None]
         fit, offset = flat[corner + i * cols + j], rc - base - (i, j)
         value = value_at(fit, offset)

@@ -146,7 +146,6 @@ class ViewBuffer:
         self._clock_jumps = 0
         self._now_ns = 0
         self._suspect: tuple[int, float] | None = None
-        self._early: list[_Waiting] = []
         self._begin_item()
 
     # ---- what comes in

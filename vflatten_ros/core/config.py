@@ -122,7 +122,7 @@ class BufferConfig(Checked):
     max_views: int = option(128, "Most views kept at a time.", low=2, high=10000)
     max_megabytes: float = option(512.0, "Most memory for views, MB.", low=1.0, high=65536.0)
     max_waiting: int = option(
-        64, "Most clouds that wait for joint states at a time.", low=1, high=1000
+        32, "Most clouds that wait for joint states at a time.", low=1, high=1000
     )
     duplicate_angle_deg: float = option(
         2.0, "Views nearer in angle replace one another, the better stays, deg.", low=0.0, high=45.0
@@ -225,6 +225,39 @@ class GeodesicConfig(Checked):
 
 
 @dataclass(frozen=True)
+class IntegrationConfig(Checked):
+    """Joining two views of the two-view method (paper, section 3)."""
+
+    evidence: str = option(
+        "surface",
+        "'boundary': the paper's boundary points and lines alone; 'surface': samples of the whole surface.",
+        choices=("surface", "boundary"),
+    )
+    overlap: bool = option(
+        True,
+        "With 'surface': join the views by all cloth that both show, not by the corresponding points alone.",
+    )
+    spacing_m: float = option(0.009, "Spacing of the surface samples, m.", low=0.002, high=0.1)
+    pair_sigma_m: float = option(
+        0.003, "Error of a corresponding point, one sigma, m.", low=1e-4, high=0.1
+    )
+    pair_reach_px: int = option(
+        3, "A corresponding pixel this near to the item is moved onto it, pixels.", low=0, high=50
+    )
+    reject_m: float = option(
+        0.015,
+        "Corresponding points this far from where the others put them are left out, m.",
+        low=0.001,
+        high=0.5,
+    )
+    sway_m: float = option(0.01, "How far the item sways between the views, m.", low=1e-4, high=0.2)
+    lag_deg: float = option(0.5, "How far it lags behind the wrist, deg.", low=0.0, high=20.0)
+    same_m: float = option(
+        0.003, "Surfaces of two views this near show the same cloth, m.", low=1e-4, high=0.05
+    )
+
+
+@dataclass(frozen=True)
 class FlatteningConfig(Checked):
     """Distances to plane (paper, section 2.2)."""
 
@@ -233,11 +266,28 @@ class FlatteningConfig(Checked):
         "'springs' as the paper's, or 'majorization': weighted robust stress majorisation.",
         choices=("majorization", "springs"),
     )
+    spring_steps: int = option(20000, "Most steps of the springs.", low=1, high=1000000)
+    rounds: int = option(8, "Most reweightings of the majorisation.", low=1, high=1000)
+    inner_steps: int = option(10, "Steps of the majorisation with the same weights.", low=1, high=1000)
+    robust_sigmas: float = option(
+        4.0, "Distances off by more standard deviations lose their say.", low=0.5, high=100.0
+    )
+    tolerance_m: float = option(2e-6, "The search ends when points move less, m.", low=1e-9, high=0.01)
 
 
 @dataclass(frozen=True)
 class ContourConfig(Checked):
     """Flattened points to outline."""
+
+    cell_m: float = option(0.002, "Cell of the raster that unites the views, m.", low=5e-4, high=0.02)
+    close_m: float = option(
+        0.008, "Gaps of the flattened surface narrower than twice this are closed, m.", low=0.0, high=0.1
+    )
+    spacing_m: float = option(0.005, "Spacing of the outline's points, m.", low=0.001, high=0.1)
+    smooth_m: float = option(0.003, "Smoothing along the outline, one sigma, m.", low=0.0, high=0.1)
+    seen_m: float = option(
+        0.006, "Outline farther than this from seen cloth is not seen, m.", low=0.001, high=0.1
+    )
 
 
 @dataclass(frozen=True)
@@ -314,6 +364,9 @@ class RotationConfig(Checked):
         0.3, "Least share of neighbours that linked samples have in common.", low=0.0, high=1.0
     )
     rim_m: float = option(0.007, "Longest link round a sharp rim, m.", low=0.001, high=0.05)
+    rim_detour_m: float = option(
+        0.006, "Added to links round rims, so that paths prefer the sheet, m.", low=0.0, high=0.05
+    )
     valley_m: float = option(
         0.001, "Deepest groove that a link round a rim may cross, m.", low=0.0, high=0.02
     )
@@ -340,6 +393,7 @@ class Config:
     boundary: BoundaryConfig = BoundaryConfig()
     patches: PatchConfig = PatchConfig()
     geodesics: GeodesicConfig = GeodesicConfig()
+    integration: IntegrationConfig = IntegrationConfig()
     flattening: FlatteningConfig = FlatteningConfig()
     contour: ContourConfig = ContourConfig()
     recognition: RecognitionConfig = RecognitionConfig()

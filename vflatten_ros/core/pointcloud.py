@@ -156,9 +156,7 @@ def _as_bytes(data: Any) -> NDArray[np.uint8]:
 def _column(points: Byte, field: PointField, order: str) -> NDArray[Any]:
     """(rows, cols) view of one field's first element, in the data's byte order."""
     dtype = np.dtype(order + DATATYPES[field.datatype])
-    return np.ndarray(
-        points.shape[:2], dtype, points, offset=field.offset, strides=points.strides[:2]
-    )
+    return points[..., field.offset : field.offset + dtype.itemsize].view(dtype)[..., 0]
 
 
 def _decode_xyz(
@@ -183,14 +181,12 @@ def _decode_xyz(
 
 def _gather_xyz(points: Byte, fields: list[PointField], order: str) -> NDArray[np.float32]:
     """(rows, cols, 3) coordinates: a view of the data where they lie side by side as float32."""
-    shape = (*points.shape[:2], 3)
     offsets = [field.offset for field in fields]
     native = order == ("<" if sys.byteorder == "little" else ">")
     side_by_side = offsets == [offsets[0], offsets[0] + 4, offsets[0] + 8]
     if native and side_by_side and all(field.datatype == FLOAT32 for field in fields):
-        strides = (*points.strides[:2], 4)
-        return np.ndarray(shape, np.float32, points, offset=offsets[0], strides=strides)
-    xyz = np.empty(shape, np.float32)
+        return points[..., offsets[0] : offsets[0] + 12].view(np.float32)
+    xyz = np.empty((*points.shape[:2], 3), np.float32)
     with np.errstate(over="ignore"):  # a float64 beyond float32 becomes inf
         for axis, field in enumerate(fields):
             xyz[..., axis] = _column(points, field, order)

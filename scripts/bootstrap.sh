@@ -8,14 +8,14 @@
 #
 #   ROS_SETUP=FILE       setup file of the installed ROS 2 (default /opt/ros/jazzy/setup.bash)
 #   ROS_SETUP=none       do not use an installed ROS 2
-#   PYTHON=python3.12    interpreter of ./.venv
+#   PYTHON=python3.12    interpreter of ./.venv (default: the one it has, python3 at first)
 #
 # Running it again does only what a change since the last run asks for.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 root=$PWD
 venv=$root/.venv
-python=${PYTHON:-python3}
+python=${PYTHON:-$(readlink -e "$venv/bin/python" || echo python3)}
 ros_setup=${ROS_SETUP:-/opt/ros/jazzy/setup.bash}
 
 say() { echo "bootstrap: $*" >&2; }

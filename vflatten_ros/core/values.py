@@ -125,6 +125,17 @@ class Correspondence:
 
 
 @dataclass(frozen=True, eq=False)
+class DistanceNetwork:
+    """Distances along the cloth between pairs of points; pairs that are left out are unknown."""
+
+    i: Int  # (m,) first point
+    j: Int  # (m,) second point
+    distance_m: Float  # (m,)
+    sigma_m: Float  # (m,) one standard deviation
+    bound: Bool  # (m,) True: at most this far apart, for a path that had to bend
+
+
+@dataclass(frozen=True, eq=False)
 class FlatPoints:
     """Points of the cloth: where they hang and where they lie when the item is flat."""
 
@@ -155,6 +166,18 @@ class Outline:
     uv: Float  # (k, 2), flat frame
     sigma_m: Float  # (k,)
     inferred: Bool  # (k,) True: no view shows this part
+
+
+@dataclass(frozen=True, eq=False)
+class Flattened:
+    """What a method makes of the views, before the category is known."""
+
+    points: FlatPoints
+    start_uv: Float | None  # (n, 2) where the flattening started, rows as points
+    lines: GeodesicLines
+    outline: Outline
+    correspondences: tuple[Correspondence, ...]  # that were used
+    notices: tuple[Notice, ...]
 
 
 @dataclass(frozen=True)

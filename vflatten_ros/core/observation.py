@@ -1,0 +1,87 @@
+"""One view, prepared for flattening: its surface, its smooth patches, where cloth is hidden."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vflatten_ros.core.config import Config
+from vflatten_ros.core.errors import InvalidCorrespondence
+from vflatten_ros.core.patches import find_patches
+from vflatten_ros.core.surface import Surface, fit_surface
+from vflatten_ros.core.values import Bool, Float, Int, Progress, View
+
+GRAZING = 0.25  # cosine of the angle between ray and normal beyond which the cloth turns away
+PARALLEL_M = 1e3  # depth of parallel rays is counted from so far away, that its inverse is linear
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What one view shows."""
+
+    view: View
+    surface: Surface  # hanger frame
+    place: Int  # (n, 2) row and column of every point on the grid of rays
+    patch: Int  # (n,) smooth patch, largest first; -1: none
+    edge: Bool  # (n,) the item may end at this point; False: it goes on unseen
+
+
+def observe(view: View, config: Config, progress: Progress) -> Observation:
+    """Fit the surface of a view and part it into smooth patches."""
+    points = view.points_hanger
+    toward = _camera(view) - points
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    pixel, shape = (view.pixel, view.shape) if view.shape[0] > 1 else (None, None)
+    surface = fit_surface(points, config.surface, toward, pixel, shape, progress)
+    place, depth = surface.rays.to_grid(points)
+    place = np.rint(place).astype(np.int64)
+    depth = depth - depth.min() + PARALLEL_M if surface.rays.parallel else depth
+    cells, first, cell = np.unique(place, axis=0, return_index=True, return_inverse=True)
+    patch, hidden = find_patches(cells, depth[first], config.patches)
+    cell = cell.reshape(-1)
+    facing = np.einsum("ij,ij->i", surface.normals, toward)
+    return Observation(view, surface, place, patch[cell], ~hidden[cell] & (facing > GRAZING))
+
+
+def _camera(view: View) -> Float:
+    """Where the camera is in the hanger frame of the view: the rig frame's origin."""
+    T_rig_hanger = view.calibration.T_rig_hanger(view.angle_rad)
+    camera: Float = -T_rig_hanger[:3, :3].T @ T_rig_hanger[:3, 3]
+    return camera
+
+
+def locate(observation: Observation, pixel: tuple[int, int], reach_px: int) -> int:
+    """The item's point at a pixel, or the nearest within reach, on a patch if there is one.
+
+    Raises
+    ------
+    InvalidCorrespondence
+        The item is farther away.
+    """
+    view = observation.view
+    away = np.abs(view.pixel - np.asarray(pixel)).max(axis=1)
+    nearest = int(away.argmin())
+    if away[nearest] > reach_px:
+        row, col = view.pixel[nearest]
+        raise InvalidCorrespondence(
+            f"corresponding point (row {pixel[0]}, col {pixel[1]}) of view {view.view_id} is not on "
+            f"the item; the item's nearest pixel is ({row}, {col})"
+        )
+    if observation.patch[nearest] >= 0:
+        return nearest
+    depth = np.linalg.norm(observation.surface.raw - observation.surface.raw[nearest], axis=1)
+    usable = (away <= reach_px) & (observation.patch >= 0) & (depth < 0.012)
+    return int(np.where(usable, depth, np.inf).argmin()) if usable.any() else nearest
+
+
+def quads(observation: Observation, keep: Bool) -> Int:
+    """(m, 4) points around every square of grid places on one patch, among those to keep."""
+    place = observation.place[keep] - observation.place.min(axis=0)
+    index = np.full(place.max(axis=0, initial=0) + 1, -1, dtype=np.int64)
+    index[tuple(place.T)] = np.flatnonzero(keep)
+    corner = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1)
+    corner = corner.reshape(-1, 4)
+    corner = corner[(corner >= 0).all(axis=1)]
+    patch = observation.patch[corner]
+    return corner[(patch == patch[:, :1]).all(axis=1)]

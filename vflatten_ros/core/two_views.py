@@ -1,0 +1,450 @@
+"""The paper's method: two views and a few corresponding points (Kita & Kita 2019, section 3).
+
+With evidence 'boundary' it is the paper's: boundary points, geodesic lines between points of similar
+height, the straight distance to the next and second-next boundary point, and nothing else. With
+'surface' the cloth between the boundaries counts too: samples of every smooth patch are related to
+their neighbours, and the views are joined by all cloth that both show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.boundary import (
+    Boundary,
+    boundary_points,
+    level_pairs,
+    ring_pairs,
+    with_corresponding,
+)
+from vflatten_ros.core.config import Config
+from vflatten_ros.core.contour import outline_of_polygons, trace_outline
+from vflatten_ros.core.errors import (
+    DisconnectedSurface,
+    InvalidCorrespondence,
+    NotEnoughViews,
+)
+from vflatten_ros.core.flattening import flatten
+from vflatten_ros.core.geodesics import BENT, Geodesics, geodesic_lines
+from vflatten_ros.core.integration import (
+    Joint,
+    SurfaceSamples,
+    align,
+    consistent_pairs,
+    join,
+    merged,
+    network_of,
+    start_places,
+    unknowns,
+)
+from vflatten_ros.core.observation import Observation, locate, observe, quads
+from vflatten_ros.core.sampling import thinned
+from vflatten_ros.core.unrolling import Complex, Relations, carry, frames_of, unroll
+from vflatten_ros.core.values import (
+    Bool,
+    Correspondence,
+    DistanceNetwork,
+    FlatPoints,
+    Flattened,
+    Float,
+    GeodesicLines,
+    Int,
+    Notice,
+    Outline,
+    Progress,
+    View,
+    no_progress,
+)
+
+LINES_PER_POINT = 3  # geodesic lines that start at a boundary point
+POINT_SIGMA_M = 0.002  # of a flattened point, whatever its stress
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Two observations and the points that correspond between them."""
+
+    a: Observation
+    b: Observation
+    at_a: Int  # (k,) rows of the points of each
+    at_b: Int
+    used: tuple[Correspondence, ...]
+    notices: tuple[Notice, ...]
+
+
+def flatten_two_views(
+    views: Sequence[View],
+    correspondences: Sequence[Correspondence],
+    config: Config,
+    progress: Progress = no_progress,
+) -> Flattened:
+    """Flatten the side of an item that two views show.
+
+    Parameters
+    ----------
+    views : sequence of View
+        The two views, or more, of which the correspondences name two.
+    correspondences : sequence of Correspondence
+        Two or more points of the cloth seen in both.
+    config : Config
+
+    Raises
+    ------
+    NotEnoughViews
+        Not two views, or correspondences of views that are not there.
+    InvalidCorrespondence
+        Fewer than two, outside the item, or contradicting one another.
+    DisconnectedSurface
+        Nothing joins the two views.
+    """
+    pair = _observe_pair(views, correspondences, config, progress)
+    method = _from_boundaries if config.integration.evidence == "boundary" else _from_surfaces
+    return method(pair, config, progress)
+
+
+def _observe_pair(
+    views: Sequence[View], given: Sequence[Correspondence], config: Config, progress: Progress
+) -> _Pair:
+    first, second = _two_views(views, given)
+    pixels = [
+        (c.pixel_a, c.pixel_b) if c.view_a == first.view_id else (c.pixel_b, c.pixel_a) for c in given
+    ]
+    a = observe(first, config, lambda stage, share: progress(stage, 0.5 * share))
+    b = observe(second, config, lambda stage, share: progress(stage, 0.5 + 0.5 * share))
+    reach = config.integration.pair_reach_px
+    at_a = np.array([locate(a, p, reach) for p, _ in pixels])
+    at_b = np.array([locate(b, q, reach) for _, q in pixels])
+    keep = consistent_pairs(a.surface.points[at_a], b.surface.points[at_b], config.integration)
+    if keep.sum() < 2:
+        raise InvalidCorrespondence(
+            f"the {len(keep)} corresponding points contradict one another: at most {keep.sum()} can "
+            "be points of one item that hangs still; check them"
+        )
+    notices = tuple(_rejected(c) for c, kept in zip(given, keep, strict=True) if not kept)
+    used = tuple(c for c, kept in zip(given, keep, strict=True) if kept)
+    return _Pair(a, b, at_a[keep], at_b[keep], used, notices)
+
+
+def _rejected(pair: Correspondence) -> Notice:
+    text = (
+        f"view {pair.view_a} pixel {pair.pixel_a} and view {pair.view_b} pixel {pair.pixel_b} are not "
+        "the same point of the item, if the other corresponding points are right; left out"
+    )
+    return Notice("correspondence_rejected", text)
+
+
+def _two_views(views: Sequence[View], given: Sequence[Correspondence]) -> tuple[View, View]:
+    if len(views) < 2:
+        raise NotEnoughViews(f"the two-view method needs two views, got {len(views)}")
+    if len(given) < 2:
+        raise InvalidCorrespondence(
+            f"the two-view method needs two corresponding points or more (the paper: three to five), got "
+            f"{len(given)}; give them with --protocol or the add_correspondences service"
+        )
+    named = sorted({c.view_a for c in given} | {c.view_b for c in given})
+    by_id = {view.view_id: view for view in views}
+    unknown = [i for i in named if i not in by_id]
+    if unknown:
+        known = ", ".join(str(i) for i in by_id)
+        raise NotEnoughViews(f"correspondences name view {unknown[0]}; there are views {known}")
+    if len(named) != 2:
+        raise InvalidCorrespondence(
+            f"the two-view method joins two views, the correspondences name {len(named)}: {named}"
+        )
+    first, second = (v for v in views if v.view_id in named)
+    return first, second
+
+
+# --- evidence 'surface' -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """Samples of one view: corresponding points, boundary points, then the surface between."""
+
+    samples: SurfaceSamples
+    source: Int  # (n,) rows of the view's points
+    boundary: int  # samples of these that are corresponding or boundary points
+
+
+def _from_surfaces(pair: _Pair, config: Config, progress: Progress) -> Flattened:
+    a, b = (
+        _sample(o, at, config) for o, at in ((pair.a, pair.at_a), (pair.b, pair.at_b))
+    )
+    surface_a, surface_b = pair.a.surface, pair.b.surface
+    motion = align(
+        a.samples,
+        b.samples,
+        surface_a.points[pair.at_a],
+        surface_b.points[pair.at_b],
+        config.integration,
+    )
+    progress("integration", 0.0)
+    joint = join(a.samples, b.samples, np.arange(len(pair.at_a)), motion, config.integration)
+    keep = _main_piece(joint, len(a.source))
+    lines, measured = _surface_lines(pair, (a, b), config, progress)
+    rows = np.flatnonzero(keep)
+    number = np.full(len(keep), -1, dtype=np.int64)
+    number[rows] = np.arange(len(rows))
+    inside = np.flatnonzero(keep[joint.relations.i] & keep[joint.relations.j])
+    relations = _renumbered(joint.relations.part(inside), number)
+    weight = joint.weight[inside]
+    start, frame, _ = unroll(len(rows), relations, weight, 0.003)
+    network = merged(
+        [_part(network_of(joint, config.integration), number), _part(measured, number)]
+    )
+    uv, stress = flatten(network, start, config.flattening, progress)
+    frame = frames_of(relations, uv, frame, weight)
+    progress("outline", 0.0)
+    points = _flat_points(pair, (a, b), rows, uv, stress)
+    outline = _outline_of(pair, joint, len(a.source), rows, uv, frame, motion, config)
+    return Flattened(points, start, lines, outline, pair.used, pair.notices + _unplaced(joint, keep))
+
+
+def _sample(observation: Observation, corresponding: Int, config: Config) -> _Sampled:
+    surface, patch = observation.surface, observation.patch
+    ring = boundary_points(observation.place, surface.spacing_m, config.boundary).source
+    ring = np.setdiff1d(ring[patch[ring] >= 0], corresponding)
+    usable = np.flatnonzero(patch >= 0)
+    inner = usable[thinned(surface.points[usable], patch[usable], config.integration.spacing_m)]
+    inner = np.setdiff1d(inner, np.r_[corresponding, ring])
+    source = np.r_[corresponding, ring, inner]
+    samples = SurfaceSamples(surface.points[source], surface.normals[source], patch[source])
+    return _Sampled(samples, source, len(corresponding) + len(ring))
+
+
+def _main_piece(joint: Joint, count_a: int) -> Bool:
+    """The largest connected piece; it must hold cloth of both views."""
+    keep = joint.piece == 0
+    if not (keep[:count_a].any() and keep[count_a:].any()):
+        raise DisconnectedSurface(
+            "nothing joins the surfaces of the two views: give corresponding points on parts that "
+            "both views show, or views nearer in angle"
+        )
+    return keep
+
+
+def _surface_lines(
+    pair: _Pair, sampled: tuple[_Sampled, _Sampled], config: Config, progress: Progress
+) -> tuple[GeodesicLines, DistanceNetwork]:
+    """Geodesic lines between boundary samples of one patch, and what they measure."""
+    found, ends = [], []
+    for side, (observation, samples) in enumerate(zip((pair.a, pair.b), sampled, strict=True)):
+        points = samples.samples.points[: samples.boundary]
+        i, j = level_pairs(
+            points[:, 2],
+            samples.samples.patch[: samples.boundary],
+            config.geodesics.height_window_m,
+            LINES_PER_POINT,
+        )
+        far = np.linalg.norm(points[i] - points[j], axis=1) > 2 * config.integration.spacing_m
+        i, j = i[far], j[far]
+        found.append(
+            geodesic_lines(observation.surface, points[i], points[j], config.geodesics, progress)
+        )
+        ends.append(np.stack([i, j]) + side * len(sampled[0].source))
+    return _lines(pair, found), _distances(found, ends)
+
+
+def _lines(pair: _Pair, found: Sequence[Geodesics]) -> GeodesicLines:
+    ids = [np.full(len(f.length_m), o.view.view_id) for f, o in zip(found, (pair.a, pair.b), strict=True)]
+    return GeodesicLines(
+        np.concatenate([f.nodes for f in found]),
+        np.concatenate(ids),
+        np.concatenate([f.length_m for f in found]),
+        np.concatenate([f.sigma_m for f in found]),
+        np.concatenate([f.flagged for f in found]),
+    )
+
+
+def _distances(found: Sequence[Geodesics], ends: Sequence[Int]) -> DistanceNetwork:
+    """Lines that stay on observed cloth; a bent one bounds the distance from above."""
+    i, j = np.concatenate(ends, axis=1)
+    length = np.concatenate([f.length_m for f in found])
+    sigma = np.concatenate([f.sigma_m for f in found])
+    bent = np.concatenate([f.reason == BENT for f in found])
+    flagged = np.concatenate([f.flagged for f in found])
+    keep = ~flagged | bent
+    return DistanceNetwork(i[keep], j[keep], length[keep], sigma[keep] + 0.001, bent[keep])
+
+
+def _renumbered(relations: Relations, number: Int) -> Relations:
+    return Relations(
+        number[relations.i], number[relations.j], relations.ahead, relations.back, relations.turn
+    )
+
+
+def _part(network: DistanceNetwork, number: Int) -> DistanceNetwork:
+    """Distances between points that keep a number."""
+    i, j = number[network.i], number[network.j]
+    k = (i >= 0) & (j >= 0)
+    return DistanceNetwork(i[k], j[k], network.distance_m[k], network.sigma_m[k], network.bound[k])
+
+
+def _flat_points(
+    pair: _Pair, sampled: Sequence[_Sampled], rows: Int, uv: Float, stress: Float
+) -> FlatPoints:
+    count = len(sampled[0].source)
+    of_b = rows >= count
+    source = np.concatenate([s.source for s in sampled])[rows]
+    xyz = np.concatenate([s.samples.points for s in sampled])[rows]
+    pixel = np.empty((len(rows), 2), dtype=np.int64)
+    pixel[~of_b] = pair.a.view.pixel[source[~of_b]]
+    pixel[of_b] = pair.b.view.pixel[source[of_b]]
+    view_id = np.where(of_b, pair.b.view.view_id, pair.a.view.view_id)
+    sigma = np.hypot(POINT_SIGMA_M, stress)
+    return FlatPoints(uv, xyz, view_id, pixel, sigma, stress, np.zeros(len(rows), dtype=bool))
+
+
+def _outline_of(
+    pair: _Pair,
+    joint: Joint,
+    count_a: int,
+    rows: Int,
+    uv: Float,
+    frame: Complex,
+    motion: Float,
+    config: Config,
+) -> Outline:
+    """Outline of all pixels of the patches that were placed."""
+    places, edges, cells = [], [], []
+    shift = 0
+    for side, observation in enumerate((pair.a, pair.b)):
+        mine = (rows >= count_a) == bool(side)
+        samples, normals = joint.points[rows[mine]], joint.normals[rows[mine]]
+        points = observation.surface.points
+        if side:
+            points = points @ motion[:3, :3].T + motion[:3, 3]
+        distance, near = cKDTree(samples).query(points, k=3)
+        reach = 1.5 * config.integration.spacing_m
+        keep = (observation.patch >= 0) & (distance[:, 0] < reach)
+        distance = np.where(distance < reach, distance, np.inf)
+        near = np.where(np.isfinite(distance), near, 0)
+        placed = np.full((len(points), 2), 0.0)
+        placed[keep] = carry(
+            points[keep], samples, normals, uv[mine], frame[mine], near[keep], distance[keep]
+        )
+        number = np.full(len(points), -1, dtype=np.int64)
+        number[keep] = shift + np.arange(keep.sum())
+        cells.append(number[quads(observation, keep)])
+        places.append(placed[keep])
+        edges.append(observation.edge[keep])
+        shift += int(keep.sum())
+    everywhere = np.concatenate(places)
+    return trace_outline(
+        everywhere,
+        np.full(len(everywhere), POINT_SIGMA_M),
+        np.concatenate(edges),
+        np.concatenate(cells),
+        config.contour,
+        0.5 * min(pair.a.surface.spacing_m, pair.b.surface.spacing_m),
+    )
+
+
+def _unplaced(joint: Joint, keep: Bool) -> tuple[Notice, ...]:
+    share = 1.0 - keep.mean()
+    if share < 0.05:
+        return ()
+    text = (
+        f"{100 * share:.0f} % of what the views show is joined to the rest only behind creases and was "
+        "left out"
+    )
+    return (Notice("hidden_crease", text),)
+
+
+# --- evidence 'boundary' ------------------------------------------------------------------------
+
+
+def _from_boundaries(pair: _Pair, config: Config, progress: Progress) -> Flattened:
+    """The paper's section 3, step by step."""
+    views = (pair.a, pair.b)
+    loops, at = [], []
+    for observation, points in zip(views, (pair.at_a, pair.at_b), strict=True):
+        spacing = observation.surface.spacing_m
+        ring = boundary_points(observation.place, spacing, config.boundary)
+        ring, where = with_corresponding(ring, observation.place, points, spacing, config.boundary)
+        loops.append(ring)
+        at.append(where)
+    progress("geodesics", 0.0)
+    measured, networks, shift = [], [], 0
+    count = [len(ring.source) for ring in loops]
+    for observation, ring in zip(views, loops, strict=True):
+        lines, network = _paper_distances(observation, ring, shift, config, progress)
+        measured.append(lines)
+        networks.append(network)
+        shift += len(ring.source)
+    unknown = unknowns(count[0], count[1], at[0], at[1])
+    network = _on_unknowns(merged(networks), unknown)
+    xy = [o.view.points_view[ring.source][:, :2] for o, ring in zip(views, loops, strict=True)]
+    placed = np.vstack(start_places(xy[0], xy[1], at[0], at[1]))
+    start = np.zeros((unknown.max() + 1, 2))
+    start[unknown[::-1]] = placed[::-1]  # the first view's place counts
+    uv, stress = flatten(network, start, config.flattening, progress)
+    uv, stress = uv[unknown], stress[unknown]
+    progress("outline", 0.0)
+    return Flattened(
+        _boundary_flat_points(pair, loops, uv, stress),
+        placed,
+        _lines(pair, measured),
+        _boundary_outline(loops, uv, config),
+        pair.used,
+        pair.notices,
+    )
+
+
+def _paper_distances(
+    observation: Observation, ring: Boundary, shift: int, config: Config, progress: Progress
+) -> tuple[Geodesics, DistanceNetwork]:
+    points = observation.surface.points[ring.source]
+    i, j = level_pairs(
+        points[:, 2],
+        np.zeros(len(points), dtype=np.int64),
+        config.geodesics.height_window_m,
+        LINES_PER_POINT,
+    )
+    lines = geodesic_lines(observation.surface, points[i], points[j], config.geodesics, progress)
+    ri, rj = ring_pairs(ring.loop)
+    length = np.r_[lines.length_m, np.linalg.norm(points[ri] - points[rj], axis=1)]
+    sigma = np.r_[lines.sigma_m + 0.001, np.full(len(ri), 0.002)]
+    bound = np.r_[lines.reason == BENT, np.zeros(len(ri), dtype=bool)]
+    if config.flattening.solver == "springs":
+        bound[:] = False  # the paper has equalities only
+    return lines, DistanceNetwork(np.r_[i, ri] + shift, np.r_[j, rj] + shift, length, sigma, bound)
+
+
+def _on_unknowns(network: DistanceNetwork, unknown: Int) -> DistanceNetwork:
+    i, j = unknown[network.i], unknown[network.j]
+    k = i != j
+    return DistanceNetwork(i[k], j[k], network.distance_m[k], network.sigma_m[k], network.bound[k])
+
+
+def _boundary_flat_points(
+    pair: _Pair, loops: Sequence[Boundary], uv: Float, stress: Float
+) -> FlatPoints:
+    views = (pair.a, pair.b)
+    pixel = [o.view.pixel[ring.source] for o, ring in zip(views, loops, strict=True)]
+    xyz = [o.surface.points[ring.source] for o, ring in zip(views, loops, strict=True)]
+    ids = [np.full(len(ring.source), o.view.view_id) for o, ring in zip(views, loops, strict=True)]
+    return FlatPoints(
+        uv,
+        np.concatenate(xyz),
+        np.concatenate(ids),
+        np.concatenate(pixel).astype(np.int64),
+        np.hypot(POINT_SIGMA_M, stress),
+        stress,
+        np.zeros(len(uv), dtype=bool),
+    )
+
+
+def _boundary_outline(loops: Sequence[Boundary], uv: Float, config: Config) -> Outline:
+    """Union of the polygons of both views' loops."""
+    polygons, shift = [], 0
+    for ring in loops:
+        for number in range(int(ring.loop.max()) + 1):
+            polygons.append(uv[shift + np.flatnonzero(ring.loop == number)])
+        shift += len(ring.source)
+    return outline_of_polygons(polygons, POINT_SIGMA_M, config.contour)

@@ -1,6 +1,7 @@
 """Any legal PointCloud2 layout gives the same points; the others are refused in words."""
 
 import array
+import contextlib
 
 import numpy as np
 import pytest
@@ -193,7 +194,5 @@ def test_random_headers_never_do_worse_than_invalid_cloud():
         ]
         given = message(xyz_columns())
         given.update(height=height, width=width, point_step=point_step, row_step=row_step)
-        try:
+        with contextlib.suppress(InvalidCloud):
             decode_cloud(**{**given, "fields": fields})
-        except InvalidCloud:
-            pass

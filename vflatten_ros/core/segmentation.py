@@ -4,7 +4,7 @@ The item hangs below the gripper tip, near the wrist axis. So: take what lies in
 the axis below the tip; take away planes that come in from outside of it (wall, table) and points
 without neighbours at their depth (flying pixels); then keep the pieces that hang from the tip with
 no wider gap than one part of an item leaves when it hides another, unless they reach out of the
-cylinder or rest on such a plane.
+cylinder or stand on a table.
 
 All lengths are metric: the image's resolution enters only by the spacing measured in the cloud.
 """
@@ -25,6 +25,8 @@ Points = NDArray[np.float32]
 Pixels = NDArray[np.int32]
 SAMPLE = 1500  # points from which spacing and planes are estimated
 WALLS = 3  # most planes taken away
+LEVEL = 0.7  # least cosine between the axis and the normal of a table or floor
+SIDE = 0.1  # share of the image at either side in which no item is expected
 
 
 def make_view(
@@ -73,14 +75,17 @@ def segment(cloud: Cloud, calibration: Calibration, config: SegmentationConfig) 
         No item is seen below the gripper tip.
     """
     flat = cloud.xyz.reshape(-1, 3)
-    index, foreign, around = _near_axis(flat, calibration, config)
+    side = _image_sides(cloud, calibration)
+    index, foreign, around = _near_axis(flat, side, calibration, config)
     _check_count(len(index), config)
     spacing = point_spacing(cloud, index)
     link = max(config.link_m, 3.0 * spacing)
 
-    wall, at_wall = _walls(flat, index, foreign, around, spacing, config)
-    index, foreign = index[~wall], (foreign | at_wall)[~wall]
     up = np.array(calibration.axis_direction)
+    outside = foreign | side[index]
+    wall, on_table = _planes(flat, index, outside, around, spacing, up, config)
+    index, foreign = index[~wall], (foreign | on_table)[~wall]
+    _check_count(len(index), config)
     kept = has_support(cloud, index, spacing, up, config)
     index, foreign = index[kept], foreign[kept]
     _check_count(len(index), config)
@@ -99,8 +104,22 @@ def _check_count(count: int, config: SegmentationConfig) -> None:
         )
 
 
+def _image_sides(cloud: Cloud, calibration: Calibration) -> Bool:
+    """(rows * cols,) pixels near the borders to the left and right of the item.
+
+    What fills a narrow view from side to side is background, though it lies in the cylinder.
+    """
+    side = np.zeros(cloud.xyz.shape[:2], bool)
+    x, y, _ = np.abs(calibration.axis_direction)
+    across = side if y >= x else side.T
+    width = round(SIDE * across.shape[1])
+    if cloud.organised and width:
+        across[:, :width] = across[:, -width:] = True
+    return side.reshape(-1)
+
+
 def _near_axis(
-    flat: Points, calibration: Calibration, config: SegmentationConfig
+    flat: Points, side: Bool, calibration: Calibration, config: SegmentationConfig
 ) -> tuple[Int, Bool, Int]:
     """Points below the tip and near the axis.
 
@@ -108,7 +127,7 @@ def _near_axis(
     -------
     index : indices of the points in the cylinder and one link beyond it
     foreign : which of them are beyond it
-    around : indices of the points in a wider cylinder about it
+    around : indices of the points in a wider cylinder about it, or at the image's sides
     """
     up = np.array(calibration.axis_direction)
     point, tip = np.array(calibration.axis_point), np.array(calibration.gripper_tip)
@@ -127,7 +146,7 @@ def _near_axis(
     low = np.float32((tip - point) @ up)
     below = (height < low - config.tip_clearance_m) & (height > low - config.length_m)
     inside = below & (square < (config.radius_m + config.link_m) ** 2)
-    around = below & (square > config.radius_m**2) & (square < reach**2)
+    around = below & ((square > config.radius_m**2) | side[index]) & (square < reach**2)
     return index[inside], square[inside] > config.radius_m**2, index[around]
 
 
@@ -145,25 +164,26 @@ def point_spacing(cloud: Cloud, index: Int) -> float:
     return float(np.median(near[:, 1]))
 
 
-def _walls(
+def _planes(
     flat: Points,
     index: Int,
-    foreign: Bool,
+    outside: Bool,
     around: Int,
     spacing: float,
+    up: Float,
     config: SegmentationConfig,
 ) -> tuple[Bool, Bool]:
-    """Points on walls, tables and other planes that come in from outside, and points beside them.
+    """Points on planes that come in from outside (wall, table), and what stands on tables.
 
-    The planes are found in the points around the cylinder, and only what hangs together with those
-    within a plane is taken away: no flat item is taken for a wall, nor cut by a wall elsewhere.
+    The planes are found in the points `around`, and only what hangs together in a plane with points
+    from `outside` is taken away: no flat item is taken for a wall, nor cut by a wall elsewhere.
     """
-    on_any, beside_any = np.zeros(len(index), bool), np.zeros(len(index), bool)
+    on_any, on_table = np.zeros(len(index), bool), np.zeros(len(index), bool)
     thinning = max(len(around) // SAMPLE, 1)
     evidence = flat[around[::thinning]]
     enough = max(config.wall_area_m2 / (spacing**2 * thinning), 3)
     if len(evidence) < enough:
-        return on_any, beside_any
+        return on_any, on_table
     points = flat[index]
     for _ in range(WALLS):
         if len(evidence) < enough:
@@ -174,13 +194,14 @@ def _walls(
         evidence = evidence[~on]
         distance = plane_distance(points, plane)
         candidates = np.flatnonzero(distance < config.wall_m)
-        if not foreign[candidates].any():
+        if not outside[candidates].any():
             continue
         voxel, label = pieces(points[candidates], max(2.0 * config.link_m, 3.0 * spacing))
-        from_outside = np.bincount(label[voxel], weights=foreign[candidates]) > 0
-        on_any[candidates[from_outside[label[voxel]]]] = True
-        beside_any |= distance < config.wall_m + config.link_m
-    return on_any, beside_any
+        reaches_out = np.bincount(label[voxel], weights=outside[candidates]) > 0
+        on_any[candidates[reaches_out[label[voxel]]]] = True
+        if abs(plane[:3] @ up) > LEVEL:
+            on_table |= distance < config.wall_m + config.link_m
+    return on_any, on_table
 
 
 def has_support(

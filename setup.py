@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: the version is package.xml's, and config/ and msg/ are shipped."""
+"""What pyproject.toml cannot say: package.xml has the version; config/ and msg/ are shipped."""
 
 import re
 from pathlib import Path

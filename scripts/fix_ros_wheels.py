@@ -3,9 +3,10 @@
 
 Two things in the CMake files that the wheels install do not hold on another machine:
 
-- The exported targets name the folders where the wheels' builder kept the headers of Python and NumPy.
-- The Python generator exports NumPy's header folder. CMake refuses to export a folder that lies inside
-  the source tree, which is where .venv is; `BUILD_INTERFACE` keeps it out of the export.
+- The exported targets name the folders where the headers of Python and NumPy were on the machine
+  that built the wheels.
+- The Python generator exports NumPy's header folder. CMake refuses to export a folder that lies
+  inside the source tree, which is where .venv is; `BUILD_INTERFACE` keeps it out of the export.
 
 Running it again changes nothing.
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
 import subprocess
 import sys
@@ -40,16 +41,10 @@ def test_core_imports_no_ros_no_files_and_no_plots():
 
 def test_versions_of_ros_and_pip_packages_agree():
     version = package_xml().findtext("version")
-    done = subprocess.run(
-        [sys.executable, "setup.py", "--version"], capture_output=True, text=True, cwd=ROOT, check=True
+    printed = subprocess.check_output(
+        [sys.executable, "setup.py", "--version"], cwd=ROOT, text=True
     )
-    assert done.stdout.split()[-1] == version
-
-
-def test_changelog_has_the_version():
-    version = package_xml().findtext("version")
-    titles = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8").splitlines()
-    assert any(line.split(" ")[0] in (version, "Forthcoming") for line in titles)
+    assert printed.split()[-1] == version
 
 
 def test_every_default_survives_being_written_and_read_again():
@@ -96,30 +91,23 @@ def test_a_missing_config_file_tells_where_it_was_looked_for(monkeypatch, tmp_pa
         resources.config_path("nothing.yaml")
 
 
-def test_parameter_reference_is_up_to_date():
-    written = (ROOT / "docs" / "parameters.md").read_text(encoding="utf-8")
-    assert written == run_python("import vflatten_ros.parameters as p; print(p.reference())") + "\n", (
-        "run: make docs"
-    )
-
-
 @pytest.mark.slow
 def test_pip_installs_the_core_with_its_config_files(tmp_path):
-    """A wheel, unpacked far from the source tree, finds its categories and has the command."""
-    source = tmp_path / "source"
+    """Far from the source tree the package finds its categories and has the command."""
+    source, site = tmp_path / "source", tmp_path / "site"
     source.mkdir()
     for name in ("package.xml", "pyproject.toml", "setup.py", "README.md"):
         shutil.copy(ROOT / name, source)
-    for name in ("config", "vflatten_ros"):
+    for name in ("config", "msg", "vflatten_ros"):
         shutil.copytree(ROOT / name, source / name)
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
-    subprocess.run([*pip, "--target", str(tmp_path / "site"), str(source)], check=True, cwd=tmp_path)
-    found = subprocess.run(
-        [sys.executable, "-c", "import vflatten_ros.resources as r; print(r.config_path('categories'))"],
-        env={"PYTHONPATH": str(tmp_path / "site"), "PATH": ""},
-        capture_output=True,
-        text=True,
-        check=True,
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--target", str(site)]
+    pip = [sys.executable, "-m", "pip", "install", *options, str(source)]
+    subprocess.run(pip, check=True, cwd=tmp_path)
+    code = "from vflatten_ros.resources import config_path; print(config_path('categories'))"
+    environment = {"PYTHONPATH": str(site), "PATH": os.defpath}
+    found = subprocess.check_output(
+        [sys.executable, "-c", code], env=environment, cwd=tmp_path, text=True
     )
-    assert Path(found.stdout.strip()) == tmp_path / "site" / "vflatten_ros" / "config" / "categories"
-    assert (tmp_path / "site" / "bin" / "vflatten").is_file()
+    assert Path(found.strip()) == site / "vflatten_ros" / "config" / "categories"
+    assert (Path(found.strip()) / "trousers.yaml").is_file()
+    assert (site / "bin" / "vflatten").is_file()

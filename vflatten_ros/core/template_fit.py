@@ -12,30 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vflatten_ros.core.evidence import Evidence, look_up
 from vflatten_ros.core.templates import Float, Template
 
-Bool = NDArray[np.bool_]
+Int = NDArray[np.int64]
 
-CELL_M = 0.004  # of the distance image of the seen outline
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What was seen, prepared once for all templates."""
-
-    outline: Float  # (n, 2) evenly spaced points of the outline, m
-    normal: Float  # (n, 2) outward
-    sigma: Float  # (n,) m
-    weight: Float  # (n,) independent observations that a point stands for; 0: not seen
-    inner: Float  # (q, 2) flattened points
-    inner_sigma: Float  # (q,)
-    inner_weight: Float  # (q,)
-    origin: Float  # (2,) of the distance image
-    distance: Float  # (rows, cols) signed distance to the outline, inside negative, m
-    slope: Float  # (rows, cols, 2) its gradient
-    seen: Float  # (rows, cols) 1 where the nearest part of the outline was seen
-    centre: Float  # (2,)
-    area: float  # m2
+MISSING = 0.8  # where residuals level off, in cuts: cloth that is missing is easily believed,
+OUTSIDE = 2.0  # cloth that is too much is not
+FACING_M = 0.03  # how much farther an edge counts that faces across
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +58,10 @@ def starts(template: Template, evidence: Evidence, rotations: int) -> tuple[Floa
     """Typical cuts of the seen area in every direction: poses (r, 3) and states (r, m)."""
     typical = template.outline(np.zeros(template.dimensions))
     area, centre = _moments(typical)
-    hull = evidence.outline
-    extent = np.linalg.norm(hull - evidence.centre, axis=1).max()
+    seen_area, seen_centre = _moments(evidence.outline)
+    extent = np.linalg.norm(evidence.outline - seen_centre, axis=1).max()
     reach = np.linalg.norm(typical - centre, axis=1).max()
-    scale = 0.5 * np.log(extent / reach) + 0.25 * np.log(evidence.area / area)
+    scale = 0.5 * np.log(extent / reach) + 0.25 * np.log(seen_area / area)
     roots = np.abs(template.log_spread).astype(bool).sum(axis=1) == 1
     state = np.zeros(template.dimensions)
     state[: len(template.sizes)][roots] = scale / np.diagonal(template.log_spread)[roots]
@@ -85,7 +69,7 @@ def starts(template: Template, evidence: Evidence, rotations: int) -> tuple[Floa
     angle = np.arange(rotations) * (2.0 * np.pi / rotations)
     cos, sin = np.cos(angle), np.sin(angle)
     turned = np.stack([cos * centre[0] - sin * centre[1], sin * centre[0] + cos * centre[1]], -1)
-    poses = np.column_stack([angle, evidence.centre - turned])
+    poses = np.column_stack([angle, seen_centre - turned])
     return poses, np.tile(state, (rotations, 1))
 
 
@@ -106,18 +90,18 @@ class _System:
 
 
 def linearise(
-    template: Template, evidence: Evidence, pose: Float, state: Float, cut: float, outside_cut: float
+    template: Template, evidence: Evidence, pose: Float, state: Float, cut: float
 ) -> _System:
     """Robust normal equations at (b, 3) poses and (b, m) states."""
     points, slope = place(template, pose, state)
     k = template.vertices
     outline, moves = points[:, :k], slope[:, :k]
     terms = [
-        _seen_on_template(evidence, outline, moves, cut, outside_cut),
+        _seen_on_template(evidence, outline, moves, cut),
         _template_on_seen(evidence, outline, moves, cut),
     ]
     if len(evidence.inner):
-        terms.append(_inner_in_template(evidence, outline, moves, outside_cut))
+        terms.append(_inner_in_template(evidence, outline, moves, OUTSIDE * cut))
     rows = np.concatenate([t[0] for t in terms], axis=1)  # (b, r, 3 + m)
     residual = np.concatenate([t[1] for t in terms], axis=1)
     weight = np.concatenate([t[2] for t in terms], axis=1)
@@ -136,37 +120,45 @@ def _geman_mcclure(residual: Float, weight: Float, cut: Float | float) -> tuple[
 
 def _nearest_edge(
     query: Float, normal: Float | None, outline: Float
-) -> tuple[NDArray[np.int64], Float, Float, Float]:
+) -> tuple[Int, Float, Float, Float]:
     """Edge, place along it, signed distance and direction from the nearest of (b, k) edges.
 
     Edges that face another way than the point's normal count as farther: the two sides of a narrow
     gap must not be mistaken for one another.
     """
     step = np.roll(outline, -1, axis=1) - outline  # (b, k, 2)
-    length2 = np.maximum((step**2).sum(-1), 1e-12)
-    from_start = query[None, :, None] - outline[:, None]  # (b, n, k, 2)
-    along = np.clip((from_start * step[:, None]).sum(-1) / length2[:, None], 0.0, 1.0)
-    away = from_start - along[..., None] * step[:, None]
-    outward = np.stack([step[..., 1], -step[..., 0]], -1) / np.sqrt(length2)[..., None]
-    square = (away**2).sum(-1)
-    across = (away * outward[:, None]).sum(-1)
-    cost = square - 1e-3 * across**2  # at a corner: the edge that faces the point
+    length = np.maximum(np.hypot(step[..., 0], step[..., 1]), 1e-9)
+    forward = step / length[..., None]
+    outward = np.stack([forward[..., 1], -forward[..., 0]], -1)
+    across = _project(query, outline, outward)  # (b, n, k)
+    ahead = _project(query, outline, forward)
+    along = np.clip(ahead, 0.0, length[:, None])
+    beyond = ahead - along
+    cost = beyond**2 + (1.0 - 1e-3) * across**2  # at a corner: the edge that faces the point
     if normal is not None:
-        cost = cost + 0.03**2 * (1.0 - np.einsum("ni,bki->bnk", normal, outward))
+        cost += FACING_M**2 * (1.0 - normal @ np.swapaxes(outward, 1, 2))
     edge = cost.argmin(-1)
     pick = edge[..., None]
-    distance = np.sqrt(np.take_along_axis(square, pick, -1)[..., 0])
-    side = np.sign(np.take_along_axis(across, pick, -1)[..., 0])
-    vector = np.take_along_axis(away, pick[..., None], 2)[..., 0, :]
-    flat = np.take_along_axis(outward, pick[..., 0][..., None], 1)
-    far = distance > 1e-6
-    direction = np.where(
-        far[..., None], vector * (side / np.maximum(distance, 1e-9))[..., None], flat
+    along, beyond, across = (
+        np.take_along_axis(values, pick, -1)[..., 0] for values in (along, beyond, across)
     )
-    return edge, np.take_along_axis(along, pick, -1)[..., 0], side * distance, direction
+    batch = np.arange(len(outline))[:, None]
+    distance = np.hypot(beyond, across)
+    side = np.where(across < 0.0, -1.0, 1.0)
+    share = np.maximum(distance, 1e-9)
+    direction = outward[batch, edge] * np.where(distance > 1e-9, np.abs(across) / share, 1.0)[..., None]
+    direction += forward[batch, edge] * (side * beyond / share)[..., None]
+    return edge, along / length[batch, edge], side * distance, direction
 
 
-def _rows(edge: NDArray[np.int64], along: Float, direction: Float, moves: Float) -> Float:
+def _project(query: Float, origin: Float, axis: Float) -> Float:
+    """(b, n, k) coordinates of (n, 2) points along (b, k) unit axes from their origins."""
+    offset = (origin * axis).sum(-1)
+    projected: Float = query @ np.swapaxes(axis, 1, 2) - offset[:, None]
+    return projected
+
+
+def _rows(edge: Int, along: Float, direction: Float, moves: Float) -> Float:
     """Derivative (b, n, 3 + m) of the distances from points to the template's edges."""
     batch = np.arange(len(moves))[:, None]
     start, end = moves[batch, edge], moves[batch, (edge + 1) % moves.shape[1]]
@@ -176,13 +168,20 @@ def _rows(edge: NDArray[np.int64], along: Float, direction: Float, moves: Float)
 
 
 def _seen_on_template(
-    evidence: Evidence, outline: Float, moves: Float, cut: float, outside_cut: float
+    evidence: Evidence, outline: Float, moves: Float, cut: float
 ) -> tuple[Float, Float, Float, Float]:
     edge, along, distance, direction = _nearest_edge(evidence.outline, evidence.normal, outline)
     residual = distance / evidence.sigma
-    own_cut = np.where(residual > 0.0, outside_cut, cut)
+    own_cut = cut * np.where(residual > 0.0, OUTSIDE, MISSING)
     weight, energy = _geman_mcclure(residual, evidence.weight, own_cut)
     return _rows(edge, along, direction, moves) / evidence.sigma[:, None], residual, weight, energy
+
+
+def outline_residuals(evidence: Evidence, outline: Float) -> Float:
+    """(n,) signed distances of the seen outline from a (k, 2) template's, in sigmas."""
+    distance = _nearest_edge(evidence.outline, evidence.normal, outline[None])[2][0]
+    residual: Float = distance / evidence.sigma
+    return residual
 
 
 def _inner_in_template(
@@ -209,34 +208,15 @@ def _template_on_seen(
     rows = np.einsum("bksi,bkim,s->bksm", slope, moves, 1 - share)
     rows += np.einsum("bksi,bkim,s->bksm", slope, after_moves, share)
     sigma = float(np.median(evidence.sigma))
-    each = np.repeat(length / samples, samples, axis=1) * (evidence.weight.sum() / _perimeter(evidence))
+    each = np.repeat(length / samples, samples, axis=1) * evidence.density
     residual = distance / sigma
-    weight, energy = _geman_mcclure(residual, each * seen, cut)
+    weight, energy = _geman_mcclure(residual, each * seen, MISSING * cut)
     return rows.reshape(b, k * samples, -1) / sigma, residual, weight, energy
-
-
-def _perimeter(evidence: Evidence) -> float:
-    return float(np.linalg.norm(np.roll(evidence.outline, -1, 0) - evidence.outline, axis=1).sum())
 
 
 def samples_per_edge(edges: int) -> int:
     """Samples of every edge: about 80 in all."""
     return max(4, round(80 / edges))
-
-
-def look_up(evidence: Evidence, at: Float) -> tuple[Float, Float, Float]:
-    """Signed distance to the seen outline, its gradient, and whether that part was seen."""
-    rows, cols = evidence.distance.shape
-    cell = (at - evidence.origin) / CELL_M
-    inside = np.clip(cell, 0.0, np.array([cols, rows]) - 1.001)
-    beyond = np.linalg.norm(cell - inside, axis=-1) * CELL_M
-    low = inside.astype(np.int64)
-    u, v = np.moveaxis(inside - low, -1, 0)
-    i, j = low[..., 1], low[..., 0]
-    image = evidence.distance
-    value = (image[i, j] * (1 - u) + image[i, j + 1] * u) * (1 - v)
-    value += (image[i + 1, j] * (1 - u) + image[i + 1, j + 1] * u) * v
-    return value + beyond, evidence.slope[i, j], evidence.seen[i, j]
 
 
 def refine(
@@ -245,9 +225,11 @@ def refine(
     pose: Float,
     state: Float,
     cuts: tuple[float, ...],
-    outside_factor: float,
+    scale: float = 1.0,
 ) -> tuple[Float, Float, Float]:
     """Robust Gauss-Newton from (b, 3) poses and (b, m) states; one step for every cut.
+
+    `scale` is how large the errors are, in sigmas of the evidence.
 
     Returns
     -------
@@ -257,13 +239,13 @@ def refine(
         Theirs.
     """
     limit = np.r_[0.3, 0.08, 0.08, np.full(template.dimensions, 1.0)]
-    prior = np.r_[0.0, 0.0, 0.0, np.ones(template.dimensions)]
+    prior = scale**2 * np.r_[0.0, 0.0, 0.0, np.ones(template.dimensions)]
     damping = np.diag(prior + np.r_[1.0, 1.0, 1.0, np.zeros(template.dimensions)])
     x = np.concatenate([pose, state], axis=1)
     best_x, best = x, np.full(len(x), np.inf)
     for cut in cuts:
-        system = linearise(template, evidence, x[:, :3], x[:, 3:], cut, outside_factor * cut)
-        energy = system.energy + 0.5 * (x[:, 3:] ** 2).sum(axis=1)
+        system = linearise(template, evidence, x[:, :3], x[:, 3:], scale * cut)
+        energy = system.energy + 0.5 * (prior * x**2).sum(axis=1)
         if cut == cuts[-1]:
             better = energy < best
             best_x, best = np.where(better[:, None], x, best_x), np.where(better, energy, best)

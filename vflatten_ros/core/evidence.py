@@ -1,0 +1,205 @@
+"""What a fit of outlines may rest on, drawn from the flattened outline and points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.config import RecognitionConfig
+from vflatten_ros.core.errors import InvalidInput
+from vflatten_ros.core.templates import Float
+from vflatten_ros.core.values import Bool, FlatPoints, Int, Outline
+
+CELL_M = 0.004  # of the images
+MARGIN_M = 0.15  # of the images round the outline
+SAMPLES = 128  # of the outline, and most flattened points that a fit uses
+RIM_M = 0.03  # flattened points nearer than this to the outline, or outside, bound the item
+MOST_LINKED = 6000  # flattened points that are linked to find gaps
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What was seen, prepared once for all templates."""
+
+    outline: Float  # (n, 2) evenly spaced points of the outline, m
+    normal: Float  # (n, 2) outward
+    sigma: Float  # (n,) m
+    weight: Float  # (n,) independent observations that a point stands for; 0: not seen
+    inner: Float  # (q, 2) flattened points near the rim
+    inner_sigma: Float  # (q,)
+    inner_weight: Float  # (q,)
+    origin: Float  # (2,) of the distance image
+    distance: Float  # (rows, cols) signed distance to the outline, inside negative, m
+    slope: Float  # (rows, cols, 2) its gradient
+    seen: Float  # (rows, cols) 1 where the nearest part of the outline was seen
+    density: float  # independent observations per metre of outline
+
+    @property
+    def total(self) -> float:
+        """Independent observations in all."""
+        return float(self.weight.sum())
+
+
+def evidence_from(outline: Outline, points: FlatPoints, config: RecognitionConfig) -> Evidence:
+    """Evenly spaced outline with its gaps opened, its distance image, and points near the rim.
+
+    Raises
+    ------
+    InvalidInput
+        An outline of fewer than three points, not finite, or without area.
+    """
+    if len(outline.uv) < 3 or not np.isfinite(outline.uv).all():
+        raise InvalidInput(f"outline: expected three finite points or more, got {outline.uv.shape}")
+    if abs(_twice_area(outline.uv)) < 2e-4:
+        raise InvalidInput("outline: encloses less than 1 cm2")
+    origin = outline.uv.min(axis=0) - MARGIN_M
+    cols, rows = np.ceil((outline.uv.max(axis=0) + MARGIN_M - origin) / CELL_M).astype(int) + 1
+    body = np.zeros((rows, cols), dtype=np.uint8)
+    cv2.fillPoly(body, [_cells(outline.uv, origin)], (1,), shift=4)
+    gaps = _gaps(points, origin, body)
+    even = _evenly(_with_gaps(outline, origin, body, gaps), SAMPLES)
+    uv, sigma, inferred = even.uv, even.sigma_m, even.inferred
+    distance, slope, seen = _distance_image(uv, ~inferred, origin, (rows, cols))
+    density = 0.5 / config.correlation_m
+    weight = density * float(np.linalg.norm(uv[1] - uv[0]))
+    depth = sample(distance, (points.uv - origin) / CELL_M)
+    rim = np.flatnonzero(~points.inferred & (depth > -RIM_M))
+    rim = rim[np.linspace(0, len(rim) - 1, min(len(rim), SAMPLES)).astype(int)]
+    return Evidence(
+        outline=uv,
+        normal=_normals(uv),
+        sigma=np.hypot(sigma, config.misfit_m),
+        weight=np.where(inferred, 0.0, weight),
+        inner=points.uv[rim],
+        inner_sigma=np.hypot(points.sigma_m[rim], config.misfit_m),
+        inner_weight=np.full(len(rim), 0.5 * weight * SAMPLES / max(len(rim), 1)),
+        origin=origin,
+        distance=distance,
+        slope=slope,
+        seen=seen,
+        density=density,
+    )
+
+
+def _twice_area(uv: Float) -> float:
+    after = np.roll(uv, -1, axis=0)
+    return float((uv[:, 0] * after[:, 1] - uv[:, 1] * after[:, 0]).sum())
+
+
+def _cells(uv: Float, origin: Float) -> NDArray[np.int32]:
+    """Image coordinates in sixteenths of a cell."""
+    return np.rint((uv - origin) / CELL_M * 16).astype(np.int32)
+
+
+def _gaps(points: FlatPoints, origin: Float, body: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Where the flat outline is closed but no cloth runs across: between two legs, for one.
+
+    Points that are as near in space as in the plane lie on one piece of cloth. What no link between
+    such points comes near is a gap.
+    """
+    seen = np.flatnonzero(~points.inferred)
+    seen = seen[:: max(1, len(seen) // MOST_LINKED)]
+    nothing = np.zeros_like(body)
+    if len(seen) < 300:
+        return nothing
+    uv, xyz = points.uv[seen], points.xyz_hanger[seen]
+    tree = cKDTree(uv)
+    spacing = float(np.quantile(tree.query(uv, k=2)[0][:, 1], 0.75))
+    pairs = tree.query_pairs(max(0.010, 3.0 * spacing), output_type="ndarray")
+    flat = np.linalg.norm(uv[pairs[:, 0]] - uv[pairs[:, 1]], axis=1)
+    free = np.linalg.norm(xyz[pairs[:, 0]] - xyz[pairs[:, 1]], axis=1)
+    ends = _cells(uv, origin)[pairs[free < 1.3 * flat + 0.005]]
+    cloth = np.zeros_like(body)
+    cv2.polylines(cloth, list(ends), isClosed=False, color=(1,), shift=4)
+    reach = 2 * int(np.ceil(max(0.004, 1.5 * spacing) / CELL_M)) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    bare = ((body > 0) & (cv2.dilate(cloth, disc) == 0)).astype(np.uint8)
+    if bare.sum() > 0.4 * body.sum():
+        return nothing
+    return np.asarray(cv2.dilate(bare, disc) & body & ~cloth, dtype=np.uint8)
+
+
+def _with_gaps(
+    outline: Outline, origin: Float, body: NDArray[np.uint8], gaps: NDArray[np.uint8]
+) -> Outline:
+    """The outline, counter-clockwise, going in and out of gaps that reach it."""
+    flip = slice(None, None, 1 if _twice_area(outline.uv) > 0 else -1)
+    given = Outline(outline.uv[flip], outline.sigma_m[flip], outline.inferred[flip])
+    if not gaps.any():
+        return given
+    rest = cv2.morphologyEx(body & ~gaps & 1, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    contours, _ = cv2.findContours(rest, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    largest = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
+    if cv2.contourArea(largest.astype(np.float32)) < 0.6 * body.sum():
+        return given
+    uv = origin + CELL_M * largest
+    uv = uv if _twice_area(uv) > 0 else uv[::-1]
+    given = _evenly(given, 8 * SAMPLES)
+    far, near = cKDTree(given.uv).query(uv)
+    uv = np.where((far < 0.01)[:, None], given.uv[near], uv)
+    return Outline(uv, given.sigma_m[near], given.inferred[near] & (far < 0.02))
+
+
+def _evenly(outline: Outline, count: int) -> Outline:
+    closed = np.vstack([outline.uv, outline.uv[:1]])
+    at = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))]
+    wanted = np.arange(count) * (at[-1] / count)
+    uv = np.column_stack([np.interp(wanted, at, column) for column in closed.T])
+    sigma = np.interp(wanted, at, np.r_[outline.sigma_m, outline.sigma_m[0]])
+    inferred = np.interp(wanted, at, np.r_[outline.inferred, outline.inferred[0]].astype(float))
+    return Outline(uv, sigma, inferred > 0.5)
+
+
+def _normals(uv: Float) -> Float:
+    """Outward normals of a closed outline, over five points."""
+    along = np.roll(uv, -2, axis=0) - np.roll(uv, 2, axis=0)
+    outward = np.column_stack([along[:, 1], -along[:, 0]])
+    normals: Float = outward / np.maximum(np.linalg.norm(outward, axis=1), 1e-9)[:, None]
+    return normals
+
+
+def _distance_image(
+    uv: Float, trusted: Bool, origin: Float, shape: tuple[int, int]
+) -> tuple[Float, Float, Float]:
+    fine = _cells(uv, origin)
+    body, edge = np.zeros(shape, dtype=np.uint8), np.ones(shape, dtype=np.uint8)
+    cv2.fillPoly(body, [fine], (1,), shift=4)
+    cv2.polylines(edge, [fine], isClosed=True, color=(0,), shift=4)
+    away, label = cv2.distanceTransformWithLabels(
+        edge, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    distance = np.where(body > 0, -away, away).astype(np.float64) * CELL_M
+    down, right = np.gradient(distance, CELL_M)
+    row, col = np.nonzero(edge == 0)
+    nearest = cKDTree(uv).query(origin + CELL_M * np.column_stack([col, row]))[1]
+    of_label = np.zeros(label.max() + 1)
+    of_label[label[row, col]] = trusted[nearest]
+    return distance, np.stack([right, down], axis=-1), of_label[label]
+
+
+def sample(image: Float, cell: Float) -> Float:
+    """Values of an image between its cells; beyond it, those of its border."""
+    rows, cols = image.shape
+    inside = np.clip(cell, 0.0, np.array([cols, rows]) - 1.001)
+    low: Int = inside.astype(np.int64)
+    u, v = np.moveaxis(inside - low, -1, 0)
+    i, j = low[..., 1], low[..., 0]
+    above = image[i, j] * (1 - u) + image[i, j + 1] * u
+    below = image[i + 1, j] * (1 - u) + image[i + 1, j + 1] * u
+    value: Float = above * (1 - v) + below * v
+    return value
+
+
+def look_up(evidence: Evidence, at: Float) -> tuple[Float, Float, Float]:
+    """Signed distance to the seen outline, its gradient, and 1 where that part was seen."""
+    rows, cols = evidence.distance.shape
+    cell = (at - evidence.origin) / CELL_M
+    inside = np.clip(cell, 0.0, np.array([cols, rows]) - 1.001)
+    beyond = np.linalg.norm(cell - inside, axis=-1) * CELL_M
+    low = np.rint(inside).astype(np.int64)
+    i, j = low[..., 1], low[..., 0]
+    return sample(evidence.distance, inside) + beyond, evidence.slope[i, j], evidence.seen[i, j]

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
+from vflatten_ros.core.config import RecognitionConfig
 from vflatten_ros.core.geometry import R_VIEW_HANGER0, transform_points
 from vflatten_ros.core.model_images import MARGIN, model_image
 from vflatten_ros.core.templates import Template
@@ -89,11 +90,12 @@ def views_figure(garment: FlatGarment, views: Sequence[View]) -> Figure:
 def draw_view(ax: Axes, garment: FlatGarment, view: View, colour: str) -> None:
     """One view as the rig sees it, with its points; x right, y up, in cm from the gripper tip."""
     x, y, _ = CM * view.points_view.T
-    ax.scatter(x, y, s=1.2, c=_shade(view), marker="s", linewidths=0, rasterized=True)
+    faded = 0.45 + 0.55 * _shade(view)
+    ax.scatter(x, y, s=2.0, c=faded, marker="s", linewidths=0, rasterized=True)
     own = (garment.points.view_id == view.view_id) & (garment.points.pixel[:, 0] >= 0)
     at = CM * _places(view, garment.points.pixel[own])
-    many = len(at) > 1500
-    ax.scatter(at[:, 0], at[:, 1], s=2 if many else 9, c=colour, alpha=0.5 if many else 1.0)
+    size = float(np.clip(3000 / max(len(at), 1), 3.0, 9.0))
+    ax.scatter(at[:, 0], at[:, 1], s=size, c=colour, linewidths=0)
     for letter, place in _lettered(garment, view):
         ax.plot(*(CM * place[:2]), "o", ms=8, mfc="none", mec=VERMILION, mew=2)
         ax.annotate(
@@ -121,7 +123,7 @@ def geodesics_figure(garment: FlatGarment, views: Sequence[View]) -> Figure:
         _draw_lines(ax, garment, view, cloud, chosen)
         name = "all views" if view is None else f"view {view.view_id}"
         total, flagged = len(chosen), int(lines.flagged[chosen].sum())
-        ax.set_title(f"{name}: {total} geodesic lines, {flagged} flagged")
+        ax.set_title(f"{name}: some of {total} geodesic lines\n({flagged} flagged, orange)")
     if not panels:
         figure.text(0.5, 0.5, "no geodesic lines kept", ha="center")
     return figure
@@ -134,19 +136,28 @@ def _draw_lines(
     axes = CM * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # view -> drawn
     x, depth, y = (cloud[:: max(1, len(cloud) // DOTS_3D)] @ axes).T
     ax.scatter(x, depth, y, s=0.8, c="#A5A5A5", alpha=0.4, linewidths=0, depthshade=False)
-    for i in chosen[:: max(1, -(-len(chosen) // LINES_SHOWN))]:
+    for i in _long_ones(garment, chosen):
         nodes = _hanging(garment.lines.nodes_hanger[i], view) @ axes
         colour = ORANGE if garment.lines.flagged[i] else VERMILION
         ax.plot(*nodes.T, color=colour, lw=1.6)
         ax.plot(*nodes[[0, -1]].T, color=BLUE, marker=".", ls="none", ms=5)
     spans = np.maximum([np.ptp(x), np.ptp(depth), np.ptp(y)], 1.0)
-    ax.set_box_aspect(spans)
+    ax.set_box_aspect(spans, zoom=1.0)
     ax.view_init(elev=14, azim=-62)
     for axis, name, span in zip(
         (ax.xaxis, ax.yaxis, ax.zaxis), ("x", "depth", "y"), spans, strict=True
     ):
         axis.set_major_locator(MaxNLocator(max(2, round(6 * span / spans.max()))))
         axis.set_label_text(f"{name} (cm)")
+        axis.labelpad = 16 if name == "y" else 6
+        axis.set_tick_params(pad=6 if name == "y" else 2)
+
+
+def _long_ones(garment: FlatGarment, chosen: Any) -> Any:
+    """Some of the longer half of the lines, evenly spread over their order."""
+    length = garment.lines.length_m[chosen]
+    longer = chosen[length >= np.median(length)] if len(chosen) else chosen
+    return longer[:: max(1, -(-len(longer) // LINES_SHOWN))]
 
 
 def flattening_figure(garment: FlatGarment) -> Figure:
@@ -246,7 +257,7 @@ def category_figure(garment: FlatGarment, templates: Sequence[Template]) -> Figu
 
 
 def _draw_model(ax: Axes, template: Template) -> None:
-    image = model_image(template, 0.05)
+    image = model_image(template, RecognitionConfig().decay)
     ax.imshow(image, cmap="Blues", origin="lower", vmin=0, vmax=1)
     ax.set_xticks([])
     ax.set_yticks([])
@@ -263,7 +274,7 @@ def draw_match(ax: Axes, garment: FlatGarment, template: Template | None) -> Non
     typical = template.outline(np.zeros(template.dimensions))
     move = _similarity(garment.template_uv, typical)
     fitted = move(np.concatenate([garment.template_uv, garment.template_uv[:1]]))
-    image = model_image(template, 0.05)
+    image = model_image(template, RecognitionConfig().decay)
     middle, longest = _centre_and_length(typical)
     half = MARGIN * longest / 2
     extent = np.array([middle[0] - half, middle[0] + half, middle[1] - half, middle[1] + half])

@@ -360,7 +360,7 @@ def _check_views(recording: Recording, calibration: Calibration, buffer: ViewBuf
     where = f"{recording.path}"
     if not state.clouds_received and state.item == 1:
         raise InvalidRecording(f"{where}: no clouds on {recording.cloud_topic}{_also(recording)}")
-    if calibration.joint not in state.joints_seen:
+    if not state.joint_states and calibration.joint not in state.joints_seen:
         names = ", ".join(state.joints_seen) or "none"
         raise InvalidRecording(
             f"{where}: no joint {calibration.joint!r} on {recording.joint_topic} "

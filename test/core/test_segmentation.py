@@ -1,4 +1,4 @@
-"""The item is told from gripper, wall, table and flying pixels, whatever the camera's resolution."""
+"""The item is told from gripper, wall, table and flying pixels, at any resolution."""
 
 import json
 from pathlib import Path

@@ -32,6 +32,8 @@ from vflatten_ros.core.turntable import (
 )
 from vflatten_ros.core.values import Calibration, Cloud, View
 
+MOST_NAMES = 256  # joints remembered by name
+
 DROP_REASONS: Mapping[str, str] = {
     "no_joint_state": "no state of the wrist joint came in time",
     "too_old": "the joint states nearest to the cloud's stamp are too far from it",
@@ -154,8 +156,8 @@ class ViewBuffer:
         self, stamp_ns: int, names: Sequence[str], positions: Sequence[float], received_ns: int
     ) -> tuple[Event, ...]:
         """Take one joint state; states without the wrist joint count for the fingers only."""
-        if len(self._joints_seen) < 256:
-            self._joints_seen.update(names)
+        if len(self._joints_seen) < MOST_NAMES:
+            self._joints_seen.update(names[:MOST_NAMES])
         values = dict(zip(names, positions, strict=False))
         events: list[Event] = []
         if self._calibration.joint in values:

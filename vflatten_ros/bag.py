@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import yaml
-from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
@@ -23,8 +21,9 @@ from vflatten_ros.core.values import Calibration, Cloud, Progress, no_progress
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 JOINT_TYPE = "sensor_msgs/msg/JointState"
-# What the mcap reader and the decompressors raise on files that end early or are damaged.
-BROKEN = (McapError, EOFError, OSError, RuntimeError, ValueError, KeyError, struct.error)
+# A file that ends early or is damaged makes the mcap reader and the decompressors, which differ
+# between installations, raise errors with no nearer base in common.
+BROKEN = Exception
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +33,12 @@ class RecordedCloud:
     log_ns: int
     topic: str
     cdr: bytes  # as recorded
-    message: Any  # with the fields of sensor_msgs/PointCloud2
+    message: Any  # with the fields of sensor_msgs/PointCloud2; None: cannot be read
 
     def decode(self) -> Cloud:
         """The points; raises InvalidCloud."""
+        if self.message is None:
+            raise InvalidCloud(f"message of {len(self.cdr)} bytes ends early")
         return cloud_from(self.message)
 
 
@@ -87,23 +88,33 @@ class Recording:
         decoders: dict[int, Any] = {}
         factory = DecoderFactory()
         records = _records(path, (self.cloud_topic, self.joint_topic))
-        count = 0
+        count = unreadable = 0
         while True:
             try:
                 schema, channel, message = next(records)
-                if channel.id not in decoders:
-                    decoders[channel.id] = _decoder(factory, schema, channel, path)
-                decoded = decoders[channel.id](message.data)
             except StopIteration:
-                return
+                break
             except BROKEN as error:
                 self.warnings.append(
                     f"{path}: ends early or is damaged ({_one_line(error)}); "
                     f"used the {count} messages before; record it again or try 'mcap recover'"
                 )
-                return
+                break
             count += 1
-            yield _recorded(channel.topic, message, decoded, channel.topic == self.cloud_topic)
+            if channel.id not in decoders:
+                decoders[channel.id] = _decoder(factory, schema, channel, path)
+            try:
+                decoded = decoders[channel.id](message.data)
+            except BROKEN:
+                decoded = None
+            if channel.topic == self.cloud_topic:
+                yield RecordedCloud(message.log_time, channel.topic, message.data, decoded)
+            elif decoded is not None:
+                yield _recorded_joints(channel.topic, message, decoded)
+            else:
+                unreadable += 1
+        if unreadable:
+            self.warnings.append(f"{path}: left out {unreadable} joint states that end early")
 
 
 def open_recording(
@@ -186,9 +197,7 @@ def stamp_ns(stamp: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-def _recorded(topic: str, message: Message, decoded: Any, is_cloud: bool) -> Any:
-    if is_cloud:
-        return RecordedCloud(message.log_time, topic, message.data, decoded)
+def _recorded_joints(topic: str, message: Message, decoded: Any) -> RecordedJoints:
     stamp = stamp_ns(decoded.header.stamp)
     names, positions = tuple(decoded.name), tuple(decoded.position)
     return RecordedJoints(message.log_time, topic, message.data, stamp, names, positions)
@@ -316,7 +325,7 @@ def _records(
 ) -> Iterator[tuple[Schema | None, Channel, Message]]:
     """Messages in log order by the file's index, or in file order where it has none."""
     with path.open("rb") as stream:
-        reader = SeekingReader(stream)
+        reader = SeekingReader(stream, validate_crcs=True)
         try:
             summary = reader.get_summary()
         except BROKEN:
@@ -334,7 +343,7 @@ def _streamed(
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     with path.open("rb") as stream:
-        for record in StreamReader(stream, record_size_limit=2**32).records:
+        for record in StreamReader(stream, validate_crcs=True, record_size_limit=2**32).records:
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):

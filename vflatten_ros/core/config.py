@@ -178,6 +178,9 @@ class SurfaceConfig(Checked):
         choices=("quadratic", "linear"),
     )
     radius_m: float = option(0.0125, "Radius r0 of the local fit, m.", low=0.002, high=0.1)
+    along_rulings: bool = option(
+        True, "Average the quadratic fit along the straight lines of the cloth."
+    )
 
 
 @dataclass(frozen=True)
@@ -205,6 +208,9 @@ class PatchConfig(Checked):
     )
     margin_px: int = option(
         1, "Patches do not join through what is this near to a line of steps, pixels.", low=0, high=20
+    )
+    gap_px: int = option(
+        5, "Where other cloth follows within this, a patch's end need not be the item's, pixels.", low=1, high=50
     )
     min_points: int = option(40, "Patches of fewer pixels are left out.", low=3, high=100000)
 
@@ -276,12 +282,44 @@ class FlatteningConfig(Checked):
 
 
 @dataclass(frozen=True)
+class AssemblyConfig(Checked):
+    """Placing pieces that hidden folds part from the rest, by the category's outline."""
+
+    categories: int = option(
+        2, "Likeliest categories for which loose pieces are placed; 0: they are left out.", low=0, high=100
+    )
+    rotations: int = option(72, "Rotations tried.", low=4, high=3600)
+    hinges: int = option(4, "Places tried where two pieces touch.", low=1, high=100)
+    touch_m: float = option(
+        0.012, "Cloth this near as it hangs may touch, m.", low=0.001, high=0.1
+    )
+    hinge_m: float = option(
+        0.02, "How far from there the pieces may meet in the plane, one sigma, m.", low=0.001, high=0.5
+    )
+    misfit_m: float = option(
+        0.01, "How far ends may be from the category's outline, one sigma, m.", low=0.001, high=0.1
+    )
+    end_weight: float = option(
+        6.0, "Independent observations that a piece's ends count for.", low=0.0, high=1000.0
+    )
+    inner_weight: float = option(
+        6.0, "The same for its cloth, which must be inside and beside other cloth.", low=0.0, high=1000.0
+    )
+    sigma_m: float = option(
+        0.006, "Error of the outline where pieces were placed, one sigma, m.", low=0.0, high=0.1
+    )
+
+
+@dataclass(frozen=True)
 class ContourConfig(Checked):
     """Flattened points to outline."""
 
     cell_m: float = option(0.002, "Cell of the raster that unites the views, m.", low=5e-4, high=0.02)
     close_m: float = option(
-        0.008, "Gaps of the flattened surface narrower than twice this are closed, m.", low=0.0, high=0.1
+        0.003, "Gaps of the flattened surface narrower than twice this are closed, m.", low=0.0, high=0.1
+    )
+    bridge_m: float = option(
+        0.04, "The same for gaps between ends of what was seen, not of the item, m.", low=0.0, high=0.5
     )
     spacing_m: float = option(0.005, "Spacing of the outline's points, m.", low=0.001, high=0.1)
     smooth_m: float = option(0.003, "Smoothing along the outline, one sigma, m.", low=0.0, high=0.1)
@@ -365,7 +403,7 @@ class RotationConfig(Checked):
     )
     rim_m: float = option(0.007, "Longest link round a sharp rim, m.", low=0.001, high=0.05)
     rim_detour_m: float = option(
-        0.006, "Added to links round rims, so that paths prefer the sheet, m.", low=0.0, high=0.05
+        0.003, "Added to links round rims, so that paths prefer the sheet, m.", low=0.0, high=0.05
     )
     valley_m: float = option(
         0.001, "Deepest groove that a link round a rim may cross, m.", low=0.0, high=0.02
@@ -375,6 +413,21 @@ class RotationConfig(Checked):
     )
     local_m: float = option(
         0.15, "Nearer pairs on one sheet keep their distance both ways, m.", low=0.01, high=2.0
+    )
+    close_m: float = option(
+        0.008, "Gaps between flattened samples narrower than twice this are closed, m.", low=0.002, high=0.1
+    )
+    edge_blur_m: float = option(
+        0.004, "Blur of the flattened samples' density, m.", low=0.001, high=0.05
+    )
+    edge_density: float = option(
+        0.4, "Share of one layer's density at the outline.", low=0.05, high=1.0
+    )
+    uv_sigma_m: float = option(
+        0.004, "Least standard deviation of a flattened point, m.", low=1e-4, high=0.1
+    )
+    high_stress_m: float = option(
+        0.01, "Contradiction of distances above which the result says so, m.", low=1e-4, high=1.0
     )
     unfold_rounds: int = option(
         15, "Reweightings at each strength of spreading.", low=1, high=1000
@@ -395,6 +448,7 @@ class Config:
     geodesics: GeodesicConfig = GeodesicConfig()
     integration: IntegrationConfig = IntegrationConfig()
     flattening: FlatteningConfig = FlatteningConfig()
+    assembly: AssemblyConfig = AssemblyConfig()
     contour: ContourConfig = ContourConfig()
     recognition: RecognitionConfig = RecognitionConfig()
     measurement: MeasurementConfig = MeasurementConfig()

@@ -82,6 +82,28 @@ def quadratic_image(depth: Float, seen: Bool, where: Bool, width: float) -> tupl
     return fits, gain
 
 
+def noise_inflation(residual: Float, seen: Bool, reach: int = 3) -> float:
+    """Sum of the noise's autocorrelation: by how much correlated noise raises a mean's variance.
+
+    At least 1, that of independent noise.
+    """
+    limit = 4 * float(np.median(np.abs(residual[seen])))
+    good = seen & (np.abs(residual) < limit)
+    noise = np.where(good, residual, 0.0)
+    own = float((noise**2).sum() / max(int(good.sum()), 1))
+    total = 1.0
+    for r in range(reach + 1):
+        for c in range(-reach, reach + 1):
+            if (r, c) <= (0, 0) or r * r + c * c > reach * reach:
+                continue
+            a = (slice(0, noise.shape[0] - r), slice(max(0, -c), noise.shape[1] - max(0, c)))
+            b = (slice(r, noise.shape[0]), slice(max(0, c), noise.shape[1] - max(0, -c)))
+            both = float((good[a] & good[b]).sum())
+            if both > 0 and own > 0:
+                total += 2 * max(float((noise[a] * noise[b]).sum()) / both / own, 0.0)
+    return total
+
+
 def fill_holes(fits: Float, known: Bool, holes: Bool) -> Float:
     """Fits in large holes: the surface of least bending that continues what is known around."""
     if not holes.any():

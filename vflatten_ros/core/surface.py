@@ -16,12 +16,14 @@ from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.raygrid import RayGrid, camera_rays, parallel_rays
 from vflatten_ros.core.smoothing import (
     fill_holes,
+    noise_inflation,
     plane_fits,
     quadratic_image,
     slope_at,
     tangent_fits,
     value_at,
 )
+from vflatten_ros.core.rulings import average_along_rulings
 from vflatten_ros.core.weighted_planes import linear_fit, view_frame
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
@@ -100,6 +102,10 @@ def fit_surface(
         fits = _linear_fits(points, toward, rays, layers, measured, fits, cell, config.radius_m)
     else:
         _refit(rays, layers, measured, special, width * cell, fits, gain)
+        variance = noise**2 * gain * noise_inflation(image - fits[..., 0], seen)
+        if config.along_rulings:
+            fits, variance = average_along_rulings(fits, variance, layers, cell, width * cell)
+        gain = variance / max(noise, 1e-12) ** 2
     fits = fill_holes(fits, layers.valid & ~layers.bridged, layers.bridged)
     progress("surface", 0.9)
     return _assemble(

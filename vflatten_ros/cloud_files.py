@@ -23,6 +23,7 @@ from vflatten_ros.ply import read_ply
 FRAME = "cloud_file"
 COLOUR_KEYS = ("rgb", "colors", "colours", "color")
 POINT_KEYS = ("xyz", "points", "arr_0")
+NEAREST_M = 0.05  # of the axis to the camera
 LARGEST_M = 20.0  # clouds of indoor cameras stay below; millimetres do not
 
 
@@ -116,11 +117,13 @@ def cloud_to_view(
 def _standing(points: Float, up: Float, cloud: Cloud) -> Calibration:
     """A calibration whose axis goes up through the item's highest point."""
     top = points[int((points @ up).argmax())]
-    sideways = float(np.linalg.norm(top - (top @ up) * up))
-    if sideways < 0.05:
+    level = points - np.outer(points @ up, up)
+    away = float(np.linalg.norm(level.mean(axis=0)))
+    reach = float(np.linalg.norm(level - level.mean(axis=0), axis=1).max())
+    if away < reach or np.linalg.norm(top - (top @ up) * up) < NEAREST_M:
         raise InvalidCloud(
-            f"the item's top is {sideways:.3f} m beside the origin, where the camera is expected; "
-            "give the cloud in its camera's frame, and --up in that frame"
+            f"the item's middle is {away:.3f} m beside the origin, where the camera is expected, "
+            f"and the item reaches {reach:.3f} m; give the cloud and --up in the camera's frame"
         )
     x, y, z = top.tolist()
     a, b, c = up.tolist()

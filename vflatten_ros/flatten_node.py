@@ -76,6 +76,7 @@ class FlattenNode(AnsweringLifecycleNode):
         self.frames = Frames(self)
         self.errors = 0  # of our own, caught by the main loop
         self._finished = self._failed = 0
+        self._failing = False
         self._last = ""
         self._throttle = Throttle()
         self._declared = Parameters(self, lambda: self.lifecycle_state()[0] == ACTIVE)
@@ -256,9 +257,11 @@ class FlattenNode(AnsweringLifecycleNode):
 
     def _on_outcome(self, task: Task, outcome: Outcome) -> None:
         if outcome.garment is None:
-            self._failed += not outcome.cancelled
+            self._failing = not outcome.cancelled
+            self._failed += self._failing
             self._last = "cancelled" if outcome.cancelled else outcome.error.splitlines()[0]
             return
+        self._failing = False
         self._finished += 1
         self._last = summary(outcome.garment)
         if self.session is not None and task.item == self.session.buffer.state().item:
@@ -289,7 +292,9 @@ class FlattenNode(AnsweringLifecycleNode):
         statuses += self._sensors.statuses(self.settings.node.node.no_data_warning_s)
         if self.session is not None:
             statuses.append(buffer_status(self.session))
-        statuses.append(flattening_status(self.goals, self._finished, self._failed, self._last))
+        statuses.append(
+            flattening_status(self.goals, self._finished, self._failed, self._failing, self._last)
+        )
         return statuses
 
     def destroy_node(self) -> None:

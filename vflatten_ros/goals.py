@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from vflatten_ros.core.config import Config
@@ -12,7 +12,13 @@ from vflatten_ros.core.values import Correspondence, View
 from vflatten_ros.worker import Died, Outcome, Ready, Step, Worker
 
 CANCEL_GRACE_S = 0.2  # then the process is ended
-STAGES = ("messages",)
+# Seconds of each stage; only their shares count, and only until the first flattening is done.
+FIRST_GUESS: Mapping[str, Mapping[str, float]] = {
+    "kita2019": {
+        "surface": 0.5, "integration": 0.1, "geodesics": 0.7, "flattening": 0.5, "outline": 0.1,
+        "recognition": 0.3, "measurement": 0.1, "messages": 0.1,
+    },
+}  # fmt: skip
 START_PAUSE_S = 5.0  # before another try, if the process cannot even start
 
 
@@ -26,9 +32,22 @@ class Task:
     item: int = 0  # which item the views are of
 
 
-def overall(stage: str, fraction: float) -> float:
-    """0-1 of a whole flattening."""
-    return fraction if stage in STAGES[-1:] else 0.0
+class _Scale:
+    """0-1 of a whole flattening, from how long each stage took the last time."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, Mapping[str, float]] = dict(FIRST_GUESS)
+
+    def learn(self, method: str, seconds: Mapping[str, float]) -> None:
+        self._seconds[method] = seconds
+
+    def at(self, method: str, stage: str, fraction: float) -> float:
+        seconds = self._seconds.get(method, {})
+        if stage not in seconds:
+            return 0.0
+        before = list(seconds).index(stage)
+        done = sum(list(seconds.values())[:before]) + fraction * seconds[stage]
+        return min(done / max(sum(seconds.values()), 1e-9), 1.0)
 
 
 @dataclass(eq=False)
@@ -63,6 +82,8 @@ class Goals:
         self._last: tuple[Task, Outcome] | None = None
         self._finished: list[tuple[Task, Outcome]] = []
         self.stage, self.fraction = "", 0.0
+        self._progress = 0.0
+        self._scale = _Scale()
         self.restarts = 0
         self.ready = False
         self._start_at: float | None = None
@@ -75,7 +96,7 @@ class Goals:
     @property
     def progress(self) -> float:
         """0-1 of the task being worked on."""
-        return overall(self.stage, self.fraction)
+        return self._progress
 
     @property
     def waiting(self) -> int:
@@ -164,7 +185,7 @@ class Goals:
     def _begin_next(self) -> None:
         if self._now is None and self._waiting and self.ready:
             run = self._now = self._waiting.pop(0)
-            self.stage, self.fraction = "start", 0.0
+            self.stage, self.fraction, self._progress = "start", 0.0, 0.0
             self._worker.submit(
                 run.number, run.task.views, run.task.correspondences, run.task.config
             )
@@ -172,6 +193,8 @@ class Goals:
     def _step(self, step: Step) -> None:
         if self._now is not None and step.number == self._now.number:
             self.stage, self.fraction = step.stage, step.fraction
+            method = self._now.task.config.method
+            self._progress = max(self._progress, self._scale.at(method, step.stage, step.fraction))
             for listener in list(self._now.listeners):
                 listener.on_progress(step.stage, step.fraction)
 
@@ -182,6 +205,7 @@ class Goals:
         self._now = None
         self._finished.append((run.task, outcome))
         if outcome.garment is not None:
+            self._scale.learn(run.task.config.method, outcome.seconds)
             self._last = (run.task, outcome)
         self._begin_next()
         for listener in run.listeners:

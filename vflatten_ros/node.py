@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -13,6 +13,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from vflatten_ros import transport
 from vflatten_ros.core.errors import VFlattenError
 from vflatten_ros.flatten_node import FlattenNode
+from vflatten_ros.worker import Prepare
 
 MAX_ERRORS = 1000  # in a row
 
@@ -38,7 +39,7 @@ def spin(node: FlattenNode) -> None:
                 raise
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, prepare: Callable[[str], Prepare] | None = None) -> int:
     """Run the node.
 
     Parameters
@@ -46,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         `--params-file FILE` and `--name NAME`, or ROS arguments after `--ros-args`; by default
         those of the command line.
+    prepare : callable, optional
+        What flattens instead of the method; for tests.
 
     Returns
     -------
@@ -55,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     transport.use_profile()
     rclpy.init(args=[sys.argv[0], *_ros_arguments(sys.argv[1:] if argv is None else argv)])
     try:
-        node = FlattenNode()
+        node = FlattenNode(prepare=prepare)
     except VFlattenError as error:
         print(f"vflatten node: {error}", file=sys.stderr)
         rclpy.try_shutdown()

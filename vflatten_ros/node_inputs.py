@@ -42,7 +42,8 @@ class Traffic:
     """What has happened on one topic."""
 
     received: int = 0
-    lost: int = 0  # by the middleware's own count
+    lost: int = 0  # gaps in the publisher's numbers
+    number: int = 0  # of the last message, by its publisher
     last_s: float = 0.0  # monotonic
     incompatible: str = ""  # QoS policy that keeps a publisher from us
     quiet: bool = False
@@ -75,7 +76,7 @@ class Inputs:
                 self._counted(name),
                 _qos(options),
                 event_callbacks=SubscriptionEventCallbacks(
-                    incompatible_qos=self._on_incompatible(name), message_lost=self._on_lost(name)
+                    incompatible_qos=self._on_incompatible(name)
                 ),
             )
 
@@ -135,11 +136,12 @@ class Inputs:
             )
         return f"no {what} on {topic} for {silence:.0f} s: {remedy}"
 
-    def _counted(self, name: str) -> Callable[[Any], None]:
+    def _counted(self, name: str) -> Callable[[Any, Any], None]:
         callback = self._callbacks[name]
 
-        def take(message: Any) -> None:
+        def take(message: Any, info: Any) -> None:
             traffic = self.traffic[name]
+            self._count_lost(name, int(info.get("publication_sequence_number") or 0))
             traffic.received += 1
             traffic.last_s = time.monotonic()
             if traffic.quiet:
@@ -160,16 +162,21 @@ class Inputs:
 
         return note
 
-    def _on_lost(self, name: str) -> Callable[[Any], None]:
-        def note(event: Any) -> None:
-            self.traffic[name].lost += event.total_count_change
+    def _count_lost(self, name: str, number: int) -> None:
+        """Count what is missing before this message; a restarted publisher begins anew."""
+        traffic = self.traffic[name]
+        missing = number - traffic.number - 1 if traffic.number else 0
+        traffic.number = number
+        if missing <= 0 or name not in self._subscriptions:
+            return
+        topic = self._subscriptions[name].topic_name
+        if self._node.count_publishers(topic) == 1:  # the numbers of several interleave
+            traffic.lost += missing
             self._node.get_logger().warning(
-                f"{name}: {event.total_count} messages lost in transport since the start; "
-                f"raise {name}.depth or see docs/node.md, DDS",
+                f"{traffic.lost} messages of {topic} lost on the way since the start; raise "
+                f"{name}.depth or see docs/node.md, DDS",
                 throttle_duration_sec=REPEAT_S,
             )
-
-        return note
 
 
 def _qos_remedy(name: str, policy: str) -> str:

@@ -110,7 +110,9 @@ def buffer_status(session: Session) -> Status:
     return (WARN if only_drops else OK), "buffer", text, values
 
 
-def flattening_status(goals: Goals | None, finished: int, failed: int, last: str) -> Status:
+def flattening_status(
+    goals: Goals | None, finished: int, failed: int, failing: bool, last: str
+) -> Status:
     """Diagnostics of the flattening process."""
     if goals is None:
         return OK, "flattening", "not configured", {}
@@ -123,5 +125,8 @@ def flattening_status(goals: Goals | None, finished: int, failed: int, last: str
     }
     if not goals.ready:
         return WARN, "flattening", "the process is starting", values
-    text = f"{goals.stage} {goals.fraction:.0%}" if goals.busy else "idle"
-    return OK, "flattening", text, values
+    if goals.busy:
+        return OK, "flattening", f"{goals.stage} {goals.fraction:.0%}", values
+    if failing:
+        return WARN, "flattening", "the last one failed", values
+    return OK, "flattening", "idle", values

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from geometry_msgs.msg import PointStamped
 from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -69,7 +70,13 @@ class Services:
             (LocateLandmark, "locate_landmark", self._locate),
         ):
             node.create_service(kind, f"~/{name}", partial(self._answer, callback))
-        node.create_service(Trigger, "~/flatten", self._trigger_flatten)
+        # In a group of its own: while it waits, nothing else of its group is served.
+        node.create_service(
+            Trigger,
+            "~/flatten",
+            self._trigger_flatten,
+            callback_group=ReentrantCallbackGroup(),
+        )
         node.create_service(Trigger, "~/new_item", partial(self._trigger, self._new_item))
         node.create_service(Trigger, "~/clear", partial(self._trigger, self._clear_all_pairs))
         self._action = ActionServer(

@@ -89,11 +89,15 @@ class Player:
         self._clock_ns = -CLOCK_PERIOD_NS
         self.published = dict.fromkeys(self._publishers, 0)
 
+    def has_subscribers(self) -> bool:
+        """Whether somebody listens to both topics."""
+        return all(p.get_subscription_count() for p in self._publishers.values())
+
     def wait_for_subscribers(self, limit_s: float) -> bool:
         """Until both topics have a subscriber; False if the time was over before."""
         end = time.monotonic() + limit_s
         while rclpy.ok() and time.monotonic() < end:
-            if all(p.get_subscription_count() for p in self._publishers.values()):
+            if self.has_subscribers():
                 return True
             time.sleep(0.02)
         return False
@@ -128,6 +132,7 @@ class Player:
         for publisher in self._publishers.values():
             if publisher.get_subscription_count():
                 publisher.wait_for_all_acked(Duration(seconds=5))
+        time.sleep(0.2)  # best effort has no acknowledgement
 
 
 def rounds(recording: Recording, loops: int) -> Iterator[Iterable[Any]]:

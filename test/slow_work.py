@@ -1,0 +1,40 @@
+"""Work for the tests of the flattening process: as long, as stubborn or as broken as asked for.
+
+`geodesics.nodes` of the job's settings chooses what happens.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+
+import garments
+
+GOOD, SLOW, STUBBORN, CRASH, WRONG, MISTAKE = 30, 31, 32, 33, 34, 35
+
+
+def prepare():
+    return work
+
+
+def prepare_and_fail():
+    raise ValueError("cannot even start")
+
+
+def work(views, job, progress):
+    from vflatten_ros.core.errors import NotEnoughViews
+
+    what = job.config.geodesics.nodes
+    progress("work", 0.0)
+    if what == STUBBORN:
+        time.sleep(30.0)  # without a word
+    if what == CRASH:
+        os._exit(7)
+    if what == WRONG:
+        raise NotEnoughViews("three views are needed")
+    if what == MISTAKE:
+        raise ZeroDivisionError("a mistake of ours")
+    for step in range(100 if what == SLOW else 2):
+        progress("work", step / 100)
+        time.sleep(0.02)
+    return garments.example_garment(), {"garment": b"bytes"}

@@ -1,0 +1,96 @@
+"""What a planner asks of the present item, without ROS."""
+
+from __future__ import annotations
+
+import garments
+import numpy as np
+import pytest
+
+from vflatten_ros import messages, session
+from vflatten_ros.core.buffer import ItemStarted
+from vflatten_ros.core.config import Config
+from vflatten_ros.session import Refused, Session
+
+PAIRS = garments.example_garment().correspondences
+
+
+@pytest.fixture
+def held():
+    """A session that holds two views, as if clouds had given them."""
+    item = Session(garments.CALIBRATION, Config())
+    for view in garments.example_views():
+        item.buffer._views[view.view_id] = view
+        item.buffer._rates[view.view_id] = 0.0
+    return item
+
+
+def fields_of(pair):
+    return messages.correspondence_fields(pair, 0)
+
+
+def test_pairs_are_checked_one_by_one(held):
+    wrong = fields_of(PAIRS[0]) | {"view_b": 77}
+    off = fields_of(PAIRS[0]) | {"pixel_a": np.array([0, 0], np.int32)}
+    answers = held.add_pairs([fields_of(PAIRS[0]), wrong, off, fields_of(PAIRS[1])])
+    assert [number for number, _ in answers] == [1, 0, 0, 2]
+    assert "view 77 is not in the buffer" in answers[1][1]
+    assert "not on the item" in answers[2][1]
+    assert held.add_pairs([fields_of(PAIRS[0])]) == [(0, "the same pair is already there")]
+
+
+def test_pairs_go_with_their_views_and_numbers_are_not_used_twice(held):
+    held.add_pairs(map(fields_of, PAIRS))
+    assert held.clear_pairs([2, 9]) == (1, [9])
+    removed, unknown, _ = held.clear_views([5, 4])
+    assert (removed, unknown) == (1, [4])
+    assert not held.pairs
+    assert held.clear_pairs([]) == (0, [])
+
+
+def test_a_selection_is_kept_until_its_views_go(held):
+    assert held.selected() == (2, 5)
+    assert held.select([5]) == (5,)
+    with pytest.raises(Refused, match="view 3 is not in the buffer; views held: 2, 5") as error:
+        held.select([3])
+    assert error.value.code == session.UNKNOWN_VIEW
+    assert held.selected() == (5,)
+    held.clear_views([5])
+    assert held.selected() == (2,)
+
+
+def test_a_new_item_has_no_pairs_and_no_selection(held):
+    held.add_pairs(map(fields_of, PAIRS))
+    held.select([2])
+    events = held.new_item("requested")
+    assert any(isinstance(event, ItemStarted) for event in events)
+    assert not held.pairs
+    assert held.selected() == ()
+
+
+def test_a_task_holds_the_views_in_the_order_asked_for_and_their_pairs(held):
+    held.add_pairs(map(fields_of, PAIRS))
+    task = held.task(Config(), "kita2019", [5, 2])
+    assert [view.view_id for view in task.views] == [5, 2]
+    assert task.correspondences == PAIRS
+    assert task.config.method == "kita2019"
+    assert held.task(Config(), "", [2]).correspondences == ()
+
+
+@pytest.mark.parametrize(
+    "method, ids, code",
+    [
+        ("magic", [], session.UNKNOWN_NAME),
+        ("", [4], session.UNKNOWN_VIEW),
+        ("", [2] * (session.MAX_IDS + 1), session.INVALID_ARGUMENT),
+    ],
+)
+def test_a_task_that_cannot_be_is_refused_with_its_code(held, method, ids, code):
+    with pytest.raises(Refused) as error:
+        held.task(Config(), method, ids)
+    assert error.value.code == code
+
+
+def test_a_task_without_views_is_refused():
+    with pytest.raises(Refused, match="no views") as error:
+        Session(garments.CALIBRATION, Config()).task(Config())
+    assert error.value.code == session.NO_VIEWS

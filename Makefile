@@ -40,7 +40,7 @@ bench-peers: build/peers/ready  ## Against other libraries: docs/benchmarks.md (
 	@PYTHONPATH=. build/peers/bin/python benchmarks/bench_peers.py $(if $(QUICK),--quick) $(ARGS)
 
 reproduce: bootstrap  ## The paper's experiments: docs/reproduction.md
-	@$(IN_ENV) python -m vflatten_ros.reproduce $(ARGS)
+	@$(IN_ENV) python benchmarks/reproduce.py $(ARGS)
 
 docs: bootstrap  ## Regenerate docs/parameters.md from the defaults in the code
 	@$(IN_ENV) python -m vflatten_ros.parameters > build/parameters.md; mv build/parameters.md docs/

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import errno
 import os
 import re
 import sys
@@ -42,8 +43,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except (VFlattenError, OSError) as error:
+    except VFlattenError as error:
         return _fail(str(error), FAILED)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(where + (error.strerror or str(error)), FAILED)
     return OK
 
 
@@ -121,6 +125,7 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
 def _replay(args: argparse.Namespace) -> None:
     from vflatten_ros.replay import replay_recording
 
+    _prepare_outputs(args)
     config = _config(args, "kita2019" if args.protocol else None)
     with Stages(_show_bar(args)) as stages:
         replayed = replay_recording(
@@ -132,6 +137,7 @@ def _replay(args: argparse.Namespace) -> None:
             cloud_topic=args.cloud_topic,
             joint_topic=args.joint_topic,
             progress=stages,
+            warn=stages.warn,
         )
         _write(args, replayed, stages)
     _report(args, replayed, stages)
@@ -140,11 +146,24 @@ def _replay(args: argparse.Namespace) -> None:
 def _flatten(args: argparse.Namespace) -> None:
     from vflatten_ros.replay import flatten_file
 
+    _prepare_outputs(args)
+    config = _config(args, "kita2019")
     with Stages(_show_bar(args)) as stages:
-        config = _config(args, "kita2019")
         replayed = flatten_file(args.cloud, config, up=args.up, crop=args.crop, progress=stages)
         _write(args, replayed, stages)
     _report(args, replayed, stages)
+
+
+def _prepare_outputs(args: argparse.Namespace) -> None:
+    """Make the folders asked for: what cannot be written fails before the work, not after it."""
+    for path in filter(None, (args.json, args.mcap)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "is a folder, expected a file", str(path))
+        if not os.access(path.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, "cannot be written to", str(path.parent))
+    if args.figures:
+        args.figures.mkdir(parents=True, exist_ok=True)
 
 
 def _write(args: argparse.Namespace, replayed: Replayed, stages: Stages) -> None:
@@ -171,9 +190,7 @@ def _write(args: argparse.Namespace, replayed: Replayed, stages: Stages) -> None
 
 
 def _report(args: argparse.Namespace, replayed: Replayed, stages: Stages) -> None:
-    """Warnings always, the table unless told not to."""
-    for warning in replayed.warnings:
-        print(f"vflatten: warning: {' '.join(warning.split())}", file=sys.stderr)
+    """The table, unless told not to."""
     if not args.quiet:
         from vflatten_ros.summary import summary
 

@@ -43,6 +43,12 @@ class Stages:
             self._bar.n = min(max(fraction, 0.0), 1.0)
             self._bar.refresh()
 
+    def warn(self, text: str) -> None:
+        """Print a line above the bar."""
+        if self._bar is not None:
+            self._bar.clear()
+        print(f"vflatten: warning: {' '.join(text.split())}", file=sys.stderr)
+
     def stop(self) -> None:
         """End the last stage and take the bar away."""
         self._close(time.perf_counter())

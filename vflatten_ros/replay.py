@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from vflatten_ros.bag import Recording, gather_views, open_recording
@@ -31,8 +31,7 @@ class Replayed:
     source: str
     clouds: int
     drops: Mapping[str, int]  # reason -> clouds that gave no view
-    warnings: tuple[str, ...] = field(default=())  # what went wrong, and could be worked round
-    notes: tuple[str, ...] = field(default=())  # what was chosen
+    notes: tuple[str, ...] = ()  # what was chosen
 
 
 def replay_recording(
@@ -45,6 +44,7 @@ def replay_recording(
     cloud_topic: str | None = None,
     joint_topic: str | None = None,
     progress: Progress = no_progress,
+    warn: Callable[[str], None] = lambda text: None,
 ) -> Replayed:
     """Flatten the item of a recorded rotation.
 
@@ -62,6 +62,8 @@ def replay_recording(
     cloud_topic, joint_topic : str, optional
         Where the recording has several of the type.
     progress : Progress
+    warn : callable
+        Told what went wrong and could be worked round.
 
     Raises
     ------
@@ -75,9 +77,11 @@ def replay_recording(
     wanted = tuple(view_ids) or chosen
     recording = open_recording(path, cloud_topic, joint_topic)
     buffer = gather_views(recording, rig, _keeping_all(config) if wanted else config, progress)
+    for text in recording.warnings:
+        warn(text)
     state = buffer.state()
     views = _select(buffer.views(), wanted, recording)
-    kept, warnings = _check_pairs(pairs, views, FEWEST_PAIRS if protocol else 0)
+    kept = _check_pairs(pairs, views, FEWEST_PAIRS if protocol else 0, warn)
     garment = flatten_garment(views, kept, templates, config, progress)
     return Replayed(
         garment=garment,
@@ -86,7 +90,6 @@ def replay_recording(
         source=str(path),
         clouds=state.clouds_received,
         drops=state.drops,
-        warnings=(*recording.warnings, *warnings),
         notes=recording.guessed,
     )
 
@@ -146,9 +149,12 @@ def _select(views: Sequence[View], wanted: Sequence[int], recording: Recording) 
 
 
 def _check_pairs(
-    pairs: Sequence[Correspondence], views: Sequence[View], fewest: int
-) -> tuple[tuple[Correspondence, ...], tuple[str, ...]]:
-    """Corresponding points that lie on the item, and why the others do not."""
+    pairs: Sequence[Correspondence],
+    views: Sequence[View],
+    fewest: int,
+    warn: Callable[[str], None],
+) -> tuple[Correspondence, ...]:
+    """The corresponding points that lie on the item; InvalidCorrespondence if they are too few."""
     by_id = {view.view_id: view for view in views}
     kept: list[Correspondence] = []
     refused: list[str] = []
@@ -163,4 +169,6 @@ def _check_pairs(
             f"{len(kept)} of {len(pairs)} corresponding points are usable, "
             f"at least {fewest} are needed; {reasons}"
         )
-    return tuple(kept), tuple(refused)
+    for text in refused:
+        warn(text)
+    return tuple(kept)

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from vflatten_ros.core.assembly import place_pieces
+import numpy as np
+
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.measurement import measure
-from vflatten_ros.core.recognition import recognise
+from vflatten_ros.core.recognition import Recognition, recognise
+from vflatten_ros.core.rotation import unfold_views
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.two_views import flatten_two_views
 from vflatten_ros.core.values import (
     Correspondence,
     FlatGarment,
     Flattened,
+    GeodesicLines,
     Progress,
     View,
     no_progress,
 )
+
+HALF_PIXEL_M = 0.00125  # how far cloth reaches beyond its outermost pixels' centres
 
 
 def flatten_garment(
@@ -69,7 +78,16 @@ def _rotation(
     progress: Progress,
 ) -> Flattened:
     """The automatic method: all views of a rotation."""
-    raise NotImplementedError("method 'rotation'")
+    unfolded = unfold_views(views, correspondences, config.rotation, progress)
+    none = np.zeros(0)
+    return Flattened(
+        points=unfolded.points,
+        start_uv=None,
+        lines=GeodesicLines(np.zeros((0, 2, 3)), none.astype(np.int64), none, none, none > 0),
+        outline=unfolded.outline,
+        correspondences=(),
+        notices=unfolded.notices,
+    )
 
 
 def _described(
@@ -80,9 +98,9 @@ def _described(
     progress: Progress,
 ) -> FlatGarment:
     """Category, sizes and places of a flattened item."""
-    points, outline = flattened.points, flattened.outline
     progress("recognition", 0.0)
-    recognition = recognise(outline, points, tuple(templates), config.recognition)
+    flattened, recognition = _recognised(flattened, tuple(templates), config, progress)
+    points, outline = flattened.points, flattened.outline
     progress("measurement", 0.0)
     measured = measure(recognition, outline, points, config.measurement)
     automatic = config.method == "rotation"
@@ -106,3 +124,29 @@ def _described(
         quality=measured.quality,
         notices=flattened.notices + measured.notices,
     )
+
+
+def _recognised(
+    flattened: Flattened, templates: tuple[Template, ...], config: Config, progress: Progress
+) -> tuple[Flattened, Recognition]:
+    """Category of the item; loose pieces are placed as the likeliest categories have them."""
+    found = recognise(flattened.outline, flattened.points, templates, config.recognition)
+    if len(flattened.pieces) < 2 or not config.assembly.categories:
+        return flattened, found
+    placed = []
+    for template in templates:
+        fit = found.fits[template.category]
+        outline = fit.points()[: template.vertices]
+        whole, cost = place_pieces(flattened, outline, HALF_PIXEL_M, config.assembly, config.contour)
+        chance = np.log(max(found.probabilities[template.category], 1e-6)) - cost
+        placed.append((chance, cost, template.category, whole))
+    placed.sort(key=lambda p: -p[0])
+    best: tuple[float, Flattened, Recognition] | None = None
+    for done, (_, cost, category, whole) in enumerate(placed[: config.assembly.categories]):
+        progress("recognition", (done + 1) / (config.assembly.categories + 1))
+        again = recognise(whole.outline, whole.points, templates, config.recognition)
+        chance = np.log(max(again.probabilities[category], 1e-6)) - cost
+        if best is None or chance > best[0]:
+            best = (chance, whole, again)
+    assert best is not None
+    return best[1], best[2]

@@ -46,9 +46,13 @@ def link_samples(xyz: Float, normal: Float, config: RotationConfig) -> Links:
     sheet = (alike > 0.5) & (np.abs((chord * mean).sum(1)) < config.step_m)
     sheet = _supported(a, b, sheet, len(xyz), config)
     edge = _at_edge(a[sheet], b[sheet], xyz, normal)
-    rim = ~sheet & edge[a] & edge[b] & (alike < 0.3) & (length < config.rim_m)
+    # round a rim the normals part; where two layers face each other, they point across the gap
+    apart = ((normal[b] - normal[a]) * chord).sum(1) / 2
+    convex = apart > -config.valley_m
+    rim = ~sheet & edge[a] & edge[b] & (alike < 0.3) & (length < config.rim_m) & convex
     keep = sheet | rim
-    return Links(a[keep], b[keep], _arc(length, alike)[keep], rim[keep])
+    along = _arc(length, alike) + np.where(rim, config.rim_detour_m, 0.0)
+    return Links(a[keep], b[keep], along[keep], rim[keep])
 
 
 def _arc(chord: Float, alike: Float) -> Float:

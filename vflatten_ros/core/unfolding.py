@@ -8,72 +8,17 @@ somewhere; and otherwise the points spread. No panels, seams or correspondences 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 SPREAD = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # weight of distances that fall short, in turn
 
 
-@dataclass(frozen=True, eq=False)
-class Distances:
-    """Bounds between landmark samples, and from them to every sample."""
-
-    chosen: Int  # (k,) rows of the landmark samples
-    bound_m: Float  # (k, k) along the surface, symmetric
-    sheet_m: Float  # (k, k) without going round rims; inf where no such path
-    rows_m: Float  # (k, n) from each landmark to every sample; inf where no path
-
-
-def surface_distances(
-    a: Int, b: Int, length_m: Float, rim: Bool, count: int, config: RotationConfig
-) -> Distances:
-    """Shortest paths between farthest-point landmarks of the largest connected piece.
-
-    Parameters
-    ----------
-    a, b, length_m, rim : ndarray of shape (m,)
-        Links between samples, and which of them go round a rim.
-    count : int
-        Number of samples.
-    """
-    graph = _graph(a, b, length_m, count)
-    piece = connected_components(graph, directed=False)[1]
-    inside = piece == np.bincount(piece).argmax()
-    if inside.sum() < 0.5 * count:
-        raise DisconnectedSurface(
-            f"the surface falls into pieces, the largest has {inside.sum()} of {count} samples; "
-            "take more views or raise rotation.link_m"
-        )
-    landmarks = min(config.landmarks, int(inside.sum()))
-    chosen = [int(np.flatnonzero(inside)[0])]
-    nearest = np.full(count, np.inf)
-    rows = np.empty((landmarks, count))
-    for k in range(landmarks):
-        rows[k] = dijkstra(graph, indices=chosen[-1])
-        nearest = np.minimum(nearest, rows[k])
-        chosen.append(int(np.where(inside, nearest, -1.0).argmax()))
-    picked = np.array(chosen[:-1])
-    bound = rows[:, picked]
-    sheet_graph = _graph(a[~rim], b[~rim], length_m[~rim], count)
-    sheet = dijkstra(sheet_graph, indices=picked, limit=1.2 * config.local_m)[:, picked]
-    return Distances(picked, (bound + bound.T) / 2, np.minimum(sheet, sheet.T), rows)
-
-
-def _graph(a: Int, b: Int, length: Float, count: int) -> csr_matrix:
-    rows, columns = np.r_[a, b], np.r_[b, a]
-    return csr_matrix((np.r_[length, length], (rows, columns)), shape=(count, count))
-
-
 def unfold(
-    bound: Float, sheet: Float, config: RotationConfig, progress: Progress = no_progress
+    bound: Float, near: Bool, config: RotationConfig, progress: Progress = no_progress
 ) -> Float:
     """Plane coordinates that keep the bounds, keep near distances, and spread otherwise.
 
@@ -83,7 +28,6 @@ def unfold(
         Metres; position, rotation and mirror image are arbitrary but repeatable.
     """
     plane = _classical_scaling(bound)
-    near = (sheet < 1.05 * bound + 0.003) & (bound < config.local_m)
     rounds = [(spread, k) for spread in SPREAD for k in range(config.unfold_rounds)]
     for done, (spread, _) in enumerate(rounds):
         progress("unfold", done / len(rounds))
@@ -122,3 +66,74 @@ def _classical_scaling(bound: Float) -> Float:
     axes = axes * np.sign(axes[np.abs(axes).argmax(0), [0, 1]])
     plane: Float = axes * np.sqrt(np.maximum(values[-2:], 0.0))
     return plane
+
+
+def place_samples(
+    around: Int, around_m: Float, sheet: Bool, plane: Float
+) -> tuple[Float, Float]:
+    """Every sample's place from its distances to the landmarks around it.
+
+    Parameters
+    ----------
+    around : ndarray of shape (n, p)
+        Landmarks near each sample.
+    around_m : ndarray of shape (n, p)
+        Distances from them, inf where unknown.
+    sheet : ndarray of shape (n, p)
+        Where the distance is known both ways; elsewhere it is an upper bound.
+    plane : ndarray of shape (k, 2)
+        Places of the landmarks.
+
+    Returns
+    -------
+    uv : ndarray of shape (n, 2)
+        NaN where fewer than three landmarks are near.
+    misfit_m : ndarray of shape (n,)
+        Root of the mean squared excess over the distances, inf where uv is NaN.
+    """
+    known = np.isfinite(around_m)
+    distance = np.where(known, around_m, 0.0)
+    base = np.where(known, 1 / (distance + 0.005) ** 2, 0.0) * np.where(sheet, 1.0, 0.1)
+    anchors = plane[around]
+    uv = (base[..., None] * anchors).sum(1) / np.maximum(base.sum(1), 1e-9)[:, None]
+    for _ in range(8):
+        offset = uv[:, None] - anchors
+        apart = np.maximum(np.linalg.norm(offset, axis=2), 1e-6)
+        excess = apart - distance
+        slack = np.where(excess < 0, excess / (0.2 * distance + 0.003), excess / 0.01)
+        weight = base / (1 + slack**2)
+        along = offset / apart[..., None]
+        # damped: a single ring of landmarks leaves the direction across it loose
+        matrix = (weight[..., None] * along).transpose(0, 2, 1) @ along
+        matrix += 0.05 * weight.sum(1)[:, None, None] * np.eye(2) + 1e-9 * np.eye(2)
+        force = (along * (weight * excess)[..., None]).sum(1)
+        uv = uv - np.linalg.solve(matrix, force[..., None])[..., 0]
+    misfit = np.sqrt((base * excess.clip(0) ** 2).sum(1) / np.maximum(base.sum(1), 1e-9))
+    few = known.sum(1) < 3
+    uv[few], misfit[few] = np.nan, np.inf
+    return uv, misfit
+
+
+def orientation(
+    uv: Float, xyz: Float, normal: Float, a: Int, b: Int
+) -> Float:
+    """Which way up each sample lies: 1 with its outside up, -1 with its outside down, 0 unclear.
+
+    From the links (a, b) around a sample: whether their directions turn the same way in the plane
+    as about its normal.
+    """
+    start, end = np.r_[a, b], np.r_[b, a]
+    chord, flat = xyz[end] - xyz[start], uv[end] - uv[start]
+    mean = np.zeros((len(xyz), 3, 2))  # sum of chord x flat: its minors give the sign of the map
+    for i in range(3):
+        for j in range(2):
+            mean[:, i, j] = np.bincount(start, chord[:, i] * flat[:, j], minlength=len(xyz))
+    turn = (np.cross(mean[:, :, 0], mean[:, :, 1]) * normal).sum(1)
+    size = np.bincount(start, (chord**2).sum(1), minlength=len(xyz))
+    sign = np.nan_to_num(turn / np.maximum(size, 1e-12) ** 2)
+    for _ in range(3):  # neighbours lie the same way up, but for creases
+        around = np.bincount(start, sign[end], minlength=len(xyz))
+        sign = sign + around / np.maximum(np.bincount(start, minlength=len(xyz)), 1)
+    clear = np.abs(sign) > 0.02
+    result: Float = np.where(clear, np.sign(sign), 0.0)
+    return result

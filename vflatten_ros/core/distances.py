@@ -1,0 +1,196 @@
+"""Shortest distances along the cloth between farthest-point landmarks.
+
+A shortest path over links zigzags, and so is a few per cent too long. Where a path stays on one
+sheet, its links are laid end to end in one plane, each turned by the bend of the cloth before it
+(parallel transport): the straight line between the ends of that chain is the true distance, for
+cloth is developable. Only near landmarks are joined in this way; far ones are reached over others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra, shortest_path
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.errors import DisconnectedSurface
+from vflatten_ros.core.values import Bool, Float, Int
+
+Float32 = NDArray[np.float32]
+
+PLACED_BY = 10  # landmarks that place a sample
+FIRM_LINKS = 6  # links on the sheet that a landmark needs
+STRAIGHT_LEAST = 0.85  # a chain whose ends are nearer than this share of it went round something
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """Bounds between landmark samples, and from them to the samples around."""
+
+    chosen: Int  # (k,) rows of the landmark samples
+    bound_m: Float  # (k, k) along the surface, symmetric
+    same_sheet: Bool  # (k, k) near, and joined by a straight path on one sheet
+    around: Int  # (n, p) the landmarks nearest to each sample
+    around_m: Float  # (n, p) distance from them; inf where there is no path
+    around_sheet: Bool  # (n, p) whether by a straight path on one sheet
+    inside: Bool  # (n,) samples on the piece that the landmarks cover
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Directed links, sorted, with the complex step that each makes in its start's tangent plane."""
+
+    key: Int  # (2m,) start * n + end
+    step: NDArray[np.complex128]  # (2m,) length and direction in the frame of the start
+    turn: NDArray[np.complex128]  # (2m,) unit: takes directions in the frame of the end to that of the start
+    rim: Bool  # (2m,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Walk:
+    """Shortest paths from landmarks, walked back to straighten them."""
+
+    rows: Float32  # (k, n) length of the paths
+    before: NDArray[np.int32]  # (k, n) sample before each on its path
+    chosen: Int  # (k,) where the paths start
+    steps: _Steps
+    rim_detour_m: float
+
+    def lengths(self, landmark: Int, sample: Int) -> tuple[Float, Bool]:
+        """Distances from landmarks to samples, and whether along one sheet and straight."""
+        straight, rims = self._straight(landmark, sample)
+        path = self.rows[landmark, sample] - self.rim_detour_m * rims
+        usable = (rims == 0) & (straight > STRAIGHT_LEAST * path)
+        moved = usable & (path > 0)
+        stretch = float(np.median(path[moved] / straight[moved])) if moved.any() else 1.0
+        return np.where(usable, straight, path / stretch), usable
+
+    def _straight(self, landmark: Int, sample: Int) -> tuple[Float, Int]:
+        """Walk all paths at once: distance between their laid out ends, and rims on the way."""
+        source, count = self.chosen[landmark], self.rows.shape[1]
+        at, total = sample.astype(np.int64), np.zeros(len(sample), dtype=complex)
+        turn = np.ones(len(sample), dtype=complex)
+        rims = np.zeros(len(sample), dtype=np.int64)
+        walking = np.flatnonzero(at != source)
+        while len(walking):
+            here = at[walking]
+            there = self.before[landmark[walking], here].astype(np.int64)
+            link = np.searchsorted(self.steps.key, here * count + there)
+            total[walking] += turn[walking] * self.steps.step[link]
+            turn[walking] *= self.steps.turn[link]
+            rims[walking] += self.steps.rim[link]
+            at[walking] = there
+            walking = walking[there != source[walking]]
+        return np.abs(total), rims
+
+
+def surface_distances(
+    xyz: Float, normal: Float, a: Int, b: Int, length_m: Float, rim: Bool, config: RotationConfig
+) -> Distances:
+    """Distances between landmarks of the largest connected piece.
+
+    Parameters
+    ----------
+    xyz, normal : ndarray of shape (n, 3)
+        Samples of the surface and their outward normals.
+    a, b, length_m, rim : ndarray of shape (m,)
+        Links between samples, and which of them go round a rim.
+
+    Raises
+    ------
+    DisconnectedSurface
+        Less than half of the samples hang together.
+    """
+    count = len(xyz)
+    graph = csr_matrix(
+        (np.r_[length_m, length_m], (np.r_[a, b], np.r_[b, a])), shape=(count, count)
+    )
+    piece = connected_components(graph, directed=False)[1]
+    inside = piece == np.bincount(piece).argmax()
+    if inside.sum() < 0.5 * count:
+        raise DisconnectedSurface(
+            f"the surface falls into pieces, the largest has {inside.sum()} of {count} samples; "
+            "take more views or raise rotation.link_m"
+        )
+    # the farthest samples would be strays, which hang on the rest by a link round a rim
+    degree = np.bincount(np.r_[a[~rim], b[~rim]], minlength=count)
+    firm = inside & (degree >= FIRM_LINKS)
+    chosen, rows, before = _landmarks(graph, firm, config)
+    near = np.isfinite(rows[:, chosen]) & ~np.eye(len(chosen), dtype=bool)
+    source, target = np.nonzero(near)
+    steps = _steps(xyz, normal, a, b, length_m, rim)
+    walk = _Walk(rows, before, chosen, steps, config.rim_detour_m)
+    length, usable = walk.lengths(source, chosen[target])
+    local = np.full(near.shape, np.inf)
+    local[source, target] = length
+    local = np.fmin(local, local.T)
+    sheet = np.zeros_like(near)
+    sheet[source, target] = usable
+    sheet |= sheet.T
+    bound = shortest_path(np.where(np.isfinite(local), local, 0.0), method="D", directed=False)
+    if not np.isfinite(bound).all():
+        raise DisconnectedSurface(
+            "landmarks farther apart than rotation.local_m; raise it or rotation.landmarks"
+        )
+    return Distances(
+        chosen,
+        (bound + bound.T) / 2,
+        sheet & (local < 1.05 * bound + 0.003),
+        *_around(walk, min(PLACED_BY, len(chosen) - 1)),
+        inside,
+    )
+
+
+def _around(walk: _Walk, count: int) -> tuple[Int, Float, Bool]:
+    """Landmarks nearest to each sample, and how far they are."""
+    nearest = np.argpartition(walk.rows, count, axis=0)[:count].T
+    sample = np.broadcast_to(np.arange(len(nearest))[:, None], nearest.shape)
+    reached = np.isfinite(walk.rows[nearest, sample])
+    length = np.full(nearest.shape, np.inf)
+    sheet = np.zeros(nearest.shape, dtype=bool)
+    length[reached], sheet[reached] = walk.lengths(nearest[reached], sample[reached])
+    return nearest.astype(np.int64), length, sheet
+
+
+def _landmarks(
+    graph: csr_matrix, firm: Bool, config: RotationConfig
+) -> tuple[Int, Float, NDArray[np.int32]]:
+    """Farthest-point landmarks, their distances to all samples near them, and the paths there."""
+    limit = config.local_m
+    most = min(config.landmarks, int(firm.sum()))
+    nearest = np.where(firm, np.inf, -1.0)
+    chosen = np.empty(most, dtype=np.int64)
+    rows = np.empty((most, len(firm)), dtype=np.float32)
+    before = np.empty((most, len(firm)), dtype=np.int32)
+    for k in range(most):
+        chosen[k] = nearest.argmax()
+        row, paths = dijkstra(graph, indices=chosen[k], limit=limit, return_predecessors=True)
+        rows[k], before[k] = row, paths
+        np.minimum(nearest, row, out=nearest)
+    return chosen, rows, before
+
+
+def _steps(
+    xyz: Float, normal: Float, a: Int, b: Int, length_m: Float, rim: Bool
+) -> _Steps:
+    start, end = np.r_[a, b], np.r_[b, a]
+    order = np.argsort(start * len(xyz) + end)
+    start, end = start[order], end[order]
+    least = np.abs(normal).argmin(1)
+    e1 = np.cross(normal, np.eye(3)[least])
+    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    e2 = np.cross(normal, e1)
+    chord = xyz[end] - xyz[start]
+    leaving = (chord * e1[start]).sum(1) + 1j * (chord * e2[start]).sum(1)
+    arriving = (chord * e1[end]).sum(1) + 1j * (chord * e2[end]).sum(1)
+    leaving /= np.maximum(np.abs(leaving), 1e-12)
+    arriving /= np.maximum(np.abs(arriving), 1e-12)
+    return _Steps(
+        key=start * len(xyz) + end,
+        step=np.r_[length_m, length_m][order] * leaving,
+        turn=leaving * arriving.conj(),
+        rim=np.r_[rim, rim][order],
+    )

@@ -1,0 +1,195 @@
+"""The automatic method: all views of a rotation to the flattened surface, with no manual input.
+
+Like the pipeline, this module knows the order of its stages, which do not know each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.distances import Distances, surface_distances
+from vflatten_ros.core.errors import DisconnectedSurface
+from vflatten_ros.core.fusion import Samples, fuse
+from vflatten_ros.core.geometry import transform_directions, transform_points
+from vflatten_ros.core.registration import ViewSurface, register_views, view_surface
+from vflatten_ros.core.sheets import Links, link_samples
+from vflatten_ros.core.unfolding import orientation, place_samples, unfold
+from vflatten_ros.core.values import (
+    Correspondence,
+    FlatPoints,
+    Float,
+    Int,
+    Notice,
+    Outline,
+    Progress,
+    View,
+    no_progress,
+)
+
+CELL_M = 0.002  # of the image whose contour is the outline
+
+
+@dataclass(frozen=True, eq=False)
+class Unfolded:
+    """The visible surface, flattened."""
+
+    points: FlatPoints  # one measured point near each sample
+    side: Float  # (n,) 1 outside up, -1 outside down, 0 unclear
+    outline: Outline
+    start_uv: Float  # (n, 2)
+    stress_m: float  # rms excess over the distances
+    notices: tuple[Notice, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Samples of the whole visible surface, linked, and distances along it."""
+
+    samples: Samples
+    links: Links
+    distances: Distances
+    view_id: Int  # (n,) of the measured point nearest to each sample
+    pixel: Int  # (n, 2)
+
+
+def unfold_views(
+    views: Sequence[View],
+    correspondences: Sequence[Correspondence],
+    config: RotationConfig,
+    progress: Progress = no_progress,
+    prepared: Mapping[int, ViewSurface] | None = None,
+) -> Unfolded:
+    """Flatten the whole surface that the views show, front and back.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Of one rotation, two or more.
+    correspondences : sequence of Correspondence
+        Not needed; checked elsewhere.
+    prepared : mapping of int to ViewSurface, optional
+        Results of view_surface by view_id, made as the views arrived.
+
+    Raises
+    ------
+    NotEnoughViews, DisconnectedSurface
+    """
+    surface = whole_surface(views, config, progress, prepared or {})
+    distances, samples, links = surface.distances, surface.samples, surface.links
+    plane = unfold(distances.bound_m, distances.same_sheet, config, progress)
+    progress("outline", 0.0)
+    uv, misfit = place_samples(
+        distances.around, distances.around_m, distances.around_sheet, plane
+    )
+    return _unfolded(surface, uv, misfit, config)
+
+
+def whole_surface(
+    views: Sequence[View],
+    config: RotationConfig,
+    progress: Progress = no_progress,
+    prepared: Mapping[int, ViewSurface] | None = None,
+) -> Surface:
+    """Register and fuse the views, link the samples and measure along the links."""
+    done = prepared or {}
+    surfaces = []
+    for k, view in enumerate(views):
+        progress("surface", k / len(views))
+        surfaces.append(done[view.view_id] if view.view_id in done else view_surface(view, config))
+    progress("register", 0.0)
+    poses = register_views(surfaces, config)
+    progress("fuse", 0.0)
+    moved = zip(poses, surfaces, strict=True)
+    points = np.vstack([transform_points(pose, s.points) for pose, s in moved])
+    moved = zip(poses, surfaces, strict=True)
+    normals = np.vstack([transform_directions(pose, s.normals) for pose, s in moved])
+    view = np.concatenate([np.full(len(s.points), k) for k, s in enumerate(surfaces)])
+    row = np.concatenate([s.index for s in surfaces])
+    samples = fuse(points, normals, view, config)
+    progress("link", 0.0)
+    links = link_samples(samples.xyz, samples.normal, config)
+    progress("distances", 0.0)
+    distances = surface_distances(
+        samples.xyz, samples.normal, links.a, links.b, links.length_m, links.rim, config
+    )
+    of_view = view[samples.source]
+    pixel = np.zeros((len(of_view), 2), dtype=np.int64)
+    for k, each in enumerate(views):
+        mine = of_view == k
+        pixel[mine] = each.pixel[row[samples.source[mine]]]
+    ids = np.array([each.view_id for each in views], dtype=np.int64)
+    return Surface(samples, links, distances, ids[of_view], pixel)
+
+
+def _unfolded(surface: Surface, uv: Float, misfit: Float, config: RotationConfig) -> Unfolded:
+    samples, links = surface.samples, surface.links
+    side = orientation(uv, samples.xyz, samples.normal, links.a, links.b)
+    placed = np.isfinite(uv).all(1) & surface.distances.inside
+    points = FlatPoints(
+        uv=uv[placed],
+        xyz_hanger=samples.xyz[placed],
+        view_id=surface.view_id[placed],
+        pixel=surface.pixel[placed],
+        sigma_m=np.hypot(config.uv_sigma_m, misfit[placed]),
+        stress=misfit[placed],
+        inferred=np.zeros(int(placed.sum()), dtype=bool),
+    )
+    stress = float(np.sqrt((misfit[placed] ** 2).mean()))
+    notices = []
+    if stress > config.high_stress_m:
+        text = f"distances contradict each other by {1e3 * stress:.0f} mm"
+        notices.append(Notice("high_stress", text))
+    outline = outline_of(points.uv, points.sigma_m, config)
+    return Unfolded(points, side[placed], outline, points.uv, stress, tuple(notices))
+
+
+def outline_of(uv: Float, sigma_m: Float, config: RotationConfig) -> Outline:
+    """Where the density of the samples falls to half of that of a single layer.
+
+    A contour round every sample would go round the strays too, and be too large for it.
+    """
+    low = uv.min(0) - 10 * config.edge_blur_m
+    size = np.ceil((uv.max(0) + 10 * config.edge_blur_m - low) / CELL_M).astype(int)
+    if size.max() > 4000:
+        raise DisconnectedSurface(f"the flattened item is {size.max() * CELL_M:.1f} m wide")
+    column, row = np.rint((uv - low) / CELL_M).astype(int).T
+    cell = np.bincount(row * size[0] + column, minlength=size[0] * size[1])
+    count = cell.reshape(size[1], size[0]).astype(np.float32)
+    single = (CELL_M / config.spacing_m) ** 2  # samples of one layer in a cell
+    density = cv2.GaussianBlur(count, (0, 0), config.edge_blur_m / CELL_M)
+    inside = (density > config.edge_density * single).astype(np.uint8)
+    gap = int(round(config.close_m / CELL_M))
+    inside = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, _disc(gap))
+    contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        raise DisconnectedSurface("the flattened samples enclose no area; take more views")
+    longest = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
+    contour = low + CELL_M * _smoothed(longest)
+    if _twice_area(contour) < 0:
+        contour = contour[::-1]
+    near = cKDTree(uv).query(contour)[1]
+    return Outline(contour, sigma_m[near], np.zeros(len(contour), dtype=bool))
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    disc: NDArray[np.uint8] = cv2.getStructuringElement(
+        cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)
+    )
+    return disc
+
+
+def _smoothed(contour: Float, reach: int = 2) -> Float:
+    shifted = [np.roll(contour, k, axis=0) for k in range(-reach, reach + 1)]
+    return np.mean(shifted, axis=0)[::2]
+
+
+def _twice_area(contour: Float) -> float:
+    after = np.roll(contour, -1, axis=0)
+    return float((contour[:, 0] * after[:, 1] - contour[:, 1] * after[:, 0]).sum())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import os
 import shutil
@@ -21,6 +22,20 @@ CORE_MODULES = sorted(
     f"vflatten_ros.core.{path.stem}" for path in (ROOT / "vflatten_ros" / "core").glob("[a-z]*.py")
 )
 
+# Where the rosdep key is not the name of the import. None: PyPI only (docs/dependencies.md).
+ROSDEP_KEYS = {
+    "cv2": "python3-opencv",
+    "matplotlib": "python3-matplotlib",
+    "mcap": None,
+    "mcap_ros2": None,
+    "mpl_toolkits": "python3-matplotlib",
+    "numpy": "python3-numpy",
+    "scipy": "python3-scipy",
+    "tf2_ros": "tf2_ros_py",
+    "tqdm": "python3-tqdm",
+    "yaml": "python3-yaml",
+}
+
 
 def package_xml() -> ElementTree.Element:
     return ElementTree.parse(ROOT / "package.xml").getroot()
@@ -37,6 +52,25 @@ def test_core_imports_no_ros_no_files_and_no_plots():
     loaded = run_python(f"import sys, {', '.join(CORE_MODULES)}; print(*sys.modules)").split()
     assert CORE_MODULES[0] in loaded
     assert unwanted.isdisjoint(loaded)
+
+
+def imports_of(path: Path) -> set[str]:
+    """Top-level names that a file imports."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+    return {name.partition(".")[0] for name in names}
+
+
+def test_package_xml_declares_every_import():
+    files = [*(ROOT / "vflatten_ros").rglob("*.py"), *(ROOT / "launch").glob("*.py")]
+    imported = set().union(*map(imports_of, files)) - sys.stdlib_module_names - {"vflatten_ros"}
+    keys = {ROSDEP_KEYS.get(name, name) for name in imported} - {None}
+    declared = {item.text for item in package_xml() if item.tag in ("depend", "exec_depend")}
+    assert keys <= declared, f"missing in package.xml: {sorted(keys - declared)}"
 
 
 def test_versions_of_ros_and_pip_packages_agree():

@@ -127,22 +127,37 @@ def _label(valid: Bool, right: Bool, down: Bool) -> NDArray[np.int32]:
 
 
 def connected_window(layers: Layers, rows: Int, cols: Int, reach: int) -> Bool:
-    """(k, 2 reach + 1, 2 reach + 1) which places around each one are joined to it inside the window."""
+    """Which places around each of k places are joined to it inside a window.
+
+    Returns
+    -------
+    ndarray of shape (2 reach + 1, 2 reach + 1, k)
+    """
     pad = reach + 1
-    valid, right, down = (np.pad(m, pad) for m in (layers.valid, layers.right, layers.down))
-    span = np.arange(-reach, reach + 1) + pad
-    at = (rows[:, None, None] + span[None, :, None], cols[:, None, None] + span[None, None, :])
-    r, d = right[at][:, :, :-1], down[at][:, :-1, :]
-    reached = np.zeros((len(rows), len(span), len(span)), bool)
-    reached[:, reach, reach] = valid[at][:, reach, reach]
-    for _ in range(2 * reach):
-        before = int(reached.sum())
-        reached[:, :, 1:] |= reached[:, :, :-1] & r
-        reached[:, :, :-1] |= reached[:, :, 1:] & r
-        reached[:, 1:] |= reached[:, :-1] & d
-        reached[:, :-1] |= reached[:, 1:] & d
-        if int(reached.sum()) == before:
-            break
+    wide = layers.valid.shape[1] + 2 * pad
+    right, down = (np.pad(m, pad).ravel() for m in (layers.right, layers.down))
+    here = (rows + pad) * wide + cols + pad
+    size = 2 * reach + 1
+    open_right = np.empty((size, size - 1, len(rows)), bool)
+    open_down = np.empty((size - 1, size, len(rows)), bool)
+    for i in range(size):
+        for j in range(size):
+            at = here + (i - reach) * wide + j - reach
+            if j < size - 1:
+                right.take(at, out=open_right[i, j], mode="clip")
+            if i < size - 1:
+                down.take(at, out=open_down[i, j], mode="clip")
+    reached = np.zeros((size, size, len(rows)), bool)
+    reached[reach, reach] = layers.valid[rows, cols]
+    for _ in range(3):  # sweeps to and fro: ways with up to 3 turns back
+        for j in range(size - 1):
+            reached[:, j + 1] |= reached[:, j] & open_right[:, j]
+        for i in range(size - 1):
+            reached[i + 1] |= reached[i] & open_down[i]
+        for j in range(size - 2, -1, -1):
+            reached[:, j] |= reached[:, j + 1] & open_right[:, j]
+        for i in range(size - 2, -1, -1):
+            reached[i] |= reached[i + 1] & open_down[i]
     return reached
 
 

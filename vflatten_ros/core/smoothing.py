@@ -13,7 +13,7 @@ from scipy.sparse.linalg import spsolve
 
 from vflatten_ros.core.geometry import Float
 from vflatten_ros.core.raygrid import RayGrid
-from vflatten_ros.core.values import Bool
+from vflatten_ros.core.values import Bool, Int
 
 # second differences by row, by column and mixed (twice in the bending energy)
 BENDING = (
@@ -179,20 +179,24 @@ def _solve(normal: Float, right: Float) -> tuple[Float, Float]:
 
 
 def tangent_fits(
-    rays: RayGrid, rc: Float, points: Float, near: Bool, middle: Float, width_m: float
+    rays: RayGrid, rc: Float, points: Float, window: Int, near: Bool, middle: Float, width_m: float
 ) -> tuple[Float, Float, Bool]:
     """Quadratics in the local tangent frame, for steep places and beside jumps.
+
+    Sums run over the window, each term for all places at once: the arrays stay small.
 
     Parameters
     ----------
     rays : RayGrid
     rc : ndarray of shape (k, 2)
         Grid places of the fits.
-    points : ndarray of shape (k, n, 3)
-        Measured points around each place.
-    near : ndarray of shape (k, n)
-        Which of them count.
-    middle : ndarray of shape (k, 3)
+    points : ndarray of shape (3, all)
+        Measured points.
+    window : ndarray of shape (n, k)
+        Which of them are around each place.
+    near : ndarray of shape (n, k)
+        Which of those count.
+    middle : ndarray of shape (3, k)
         Measured point nearest to each place.
     width_m : float
         Standard deviation of the weight along the surface, metres.
@@ -201,20 +205,25 @@ def tangent_fits(
     -------
     fits (k, 6), gain (k,), good (k,)
     """
-    mass = near.astype(float)
-    away = points - middle[:, None]
-    weight = mass * np.exp(-0.5 * (away**2).sum(axis=-1) / (1.5 * width_m) ** 2)
-    weight += 1e-6 * mass + 1e-12
-    axes = _principal_axes(away, weight)
-    local = np.einsum("kij,knj->kni", axes, away) / width_m
-    u, v, w = local[..., 0], local[..., 1], local[..., 2]
-    weight = mass * np.exp(-0.5 * (u * u + v * v)) + 1e-9 * mass + 1e-12
-    basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-    scaled = basis * weight[..., None]
-    normal = np.matmul(scaled.swapaxes(1, 2), basis)
-    right = np.einsum("kni,kn->ki", scaled, w)
-    surface, gain = _solve(normal, right)
-    return _to_rays(rays, rc, middle, axes, surface, width_m, gain)
+    axes = _principal_axes(points, window, near, middle, 1.5 * width_m)
+    normal = np.zeros((6, 6, len(rc)))
+    right = np.zeros((6, len(rc)))
+    for at, counts in zip(window, near):
+        away = (points[:, at] - middle) / width_m
+        u, v, w = (a[0] * away[0] + a[1] * away[1] + a[2] * away[2] for a in axes)
+        weight = np.exp(-0.5 * (u * u + v * v)) * counts
+        basis = (weight, weight * u, weight * v, weight * u * u, weight * u * v, weight * v * v)
+        plain = (1.0, u, v, u * u, u * v, v * v)
+        for i in range(6):
+            right[i] += basis[i] * w
+            for j in range(i + 1):
+                normal[i, j] += basis[i] * plain[j]
+    for i in range(6):
+        for j in range(i):
+            normal[j, i] = normal[i, j]
+    normal[0, 0] += 1e-9
+    surface, gain = _solve(np.moveaxis(normal, 2, 0), right.T)
+    return _to_rays(rays, rc, middle.T, np.moveaxis(axes, 2, 0), surface, width_m, gain)
 
 
 def plane_fits(rays: RayGrid, rc: Float, foot: Float, normal: Float) -> Float:
@@ -232,14 +241,28 @@ def plane_fits(rays: RayGrid, rc: Float, foot: Float, normal: Float) -> Float:
     return fits
 
 
-def _principal_axes(away: Float, weight: Float) -> Float:
-    """(k, 3, 3) rows: two tangents and the normal."""
-    total = weight.sum(axis=1)
-    mean = np.einsum("kn,kni->ki", weight, away) / total[:, None]
-    d = away - mean[:, None]
-    spread = np.matmul((d * weight[..., None]).swapaxes(1, 2), d)
-    _, vectors = np.linalg.eigh(spread / np.trace(spread, axis1=1, axis2=2)[:, None, None])
-    return np.asarray(vectors[:, :, ::-1].swapaxes(1, 2))
+def _principal_axes(
+    points: Float, window: Int, near: Bool, middle: Float, width_m: float
+) -> Float:
+    """(3, 3, k) axes by component: two tangents and the normal."""
+    count = middle.shape[1]
+    total, mean = np.full(count, 1e-12), np.zeros((3, count))
+    spread = np.zeros((3, 3, count))
+    for at, counts in zip(window[::2], near[::2]):  # every other one, as on a chessboard
+        away = (points[:, at] - middle) / width_m
+        weight = counts * (np.exp(-0.5 * (away[0] ** 2 + away[1] ** 2 + away[2] ** 2)) + 1e-6)
+        total += weight
+        for i in range(3):
+            part = weight * away[i]
+            mean[i] += part
+            for j in range(i + 1):
+                spread[i, j] += part * away[j]
+    mean /= total
+    for i in range(3):
+        for j in range(i + 1):
+            spread[i, j] = spread[j, i] = spread[i, j] / total - mean[i] * mean[j]
+    _, vectors = np.linalg.eigh(np.moveaxis(spread, 2, 0))
+    return np.moveaxis(vectors[:, :, ::-1], (2, 1, 0), (0, 1, 2))
 
 
 def _to_rays(

@@ -27,7 +27,8 @@ from vflatten_ros.core.rulings import average_along_rulings
 from vflatten_ros.core.weighted_planes import linear_fit, view_frame
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
-CHUNK = 2000  # places fitted at a time, so that the arrays stay in the cache
+CHUNK = 4000  # places fitted at a time, so that the arrays stay in the cache
+REACH = 5  # grid steps to each side in a fit in the tangent frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,24 +151,19 @@ def _refit(
 ) -> None:
     """Replace fits and gain at special places by fits in the local tangent frame."""
     rows, cols = np.nonzero(special)
-    reach = 5
-    pad = np.pad(measured, ((reach, reach), (reach, reach), (0, 0)))
-    seen = np.pad(layers.seen, reach)
-    span = np.arange(2 * reach + 1)
+    wide = special.shape[1] + 2 * REACH
+    pad = ((REACH, REACH), (REACH, REACH))
+    points = np.pad(measured, (*pad, (0, 0))).reshape(-1, 3).T.copy()
+    seen = np.pad(layers.seen, pad).ravel()
+    span = np.arange(-REACH, REACH + 1)
+    offsets = (span[:, None] * wide + span).reshape(-1, 1)
     for k in range(0, len(rows), CHUNK):
         r, c = rows[k : k + CHUNK], cols[k : k + CHUNK]
-        at = (r[:, None, None] + span[None, :, None], c[:, None, None] + span[None, None, :])
-        near = connected_window(layers, r, c, reach) & seen[at]
-        window = pad[at].reshape(len(r), -1, 3)
-        source = measured.reshape(-1, 3)[layers.source[r, c]]
-        fit, variance, good = tangent_fits(
-            rays,
-            np.stack([r, c], axis=1).astype(float),
-            window,
-            near.reshape(len(r), -1),
-            source,
-            width_m,
-        )
+        window = offsets + (r + REACH) * wide + c + REACH
+        near = connected_window(layers, r, c, REACH).reshape(window.shape) & seen[window]
+        source = measured.reshape(-1, 3)[layers.source[r, c]].T
+        rc = np.stack([r, c], axis=1).astype(float)
+        fit, variance, good = tangent_fits(rays, rc, points, window, near, source, width_m)
         fits[r[good], c[good]] = fit[good]
         gain[r[good], c[good]] = variance[good]
 

@@ -116,6 +116,18 @@ def test_the_first_view_lies_within_half_a_turn_and_later_ones_are_unwrapped():
     np.testing.assert_allclose(np.diff(angles), -2 * RATE, atol=1e-9)
 
 
+def test_angles_have_the_same_bits_whenever_the_joint_states_began():
+    angles = []
+    for start_s in (0, 25):  # two turns earlier or not
+        buffer = make(**{"joints.history_s": 100.0})
+        joints(buffer, start_s, 40)
+        for k in range(10):
+            buffer.add_cloud(cloud(26 * S + k * S), 0)
+        angles.append([view.angle_rad for view in buffer.views()])
+    assert abs(angles[0][0]) <= np.pi
+    assert angles[0] == angles[1]
+
+
 def test_every_reason_to_drop_is_counted():
     buffer = make(**{"buffer.max_rate_rad_s": 1.0})
     joints(buffer, 10, 12)

@@ -224,6 +224,15 @@ def test_a_flat_item_is_not_taken_for_a_wall():
     assert recall(kept(scene.cloud()), scene.label) > 0.98
 
 
+def test_an_item_wider_than_the_radius_is_cut_there():
+    scene = hanging_item()
+    cloud = scene.cloud()
+    mask = kept(cloud, config=SegmentationConfig(radius_m=0.1))
+    radius = np.hypot(cloud.xyz[..., 0] - TIP[0], cloud.xyz[..., 2] - TIP[2])
+    assert radius[mask].max() <= 0.1 + 1e-6
+    assert mask[(scene.label == ITEM) & (radius < 0.099)].mean() > 0.98
+
+
 def test_an_empty_gripper_says_so():
     for scene in (Scene(), wall(Scene(), 2.0), wall(Scene(), 1.5)):
         with pytest.raises(EmptyView, match="below the gripper tip"):

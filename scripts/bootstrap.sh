@@ -74,6 +74,10 @@ prepare_beside_ros() {
   ( set +u; source "$ros_setup"; set -u
     "$venv/bin/python" -c 'import rclpy, numpy, scipy, cv2, matplotlib, yaml, tqdm, pytest' ) ||
     die "missing above; try: rosdep install --from-paths $root --ignore-src --rosdistro jazzy"
+  # Debian's pytest command runs Debian's interpreter, which does not see .venv.
+  printf '#!%s\nimport pytest\nraise SystemExit(pytest.console_main())\n' "$venv/bin/python" \
+    > "$venv/bin/pytest"
+  chmod +x "$venv/bin/pytest"
 }
 
 # The lines of env.sh that come before our own package.

@@ -75,9 +75,9 @@ The figures above stand side by side; they are not the same experiment.
   neighbours partly share, holes and floating pixels at edges and on grazing surfaces. The paper
   does not tell its rig's noise.
 - **What the simulation lacks**: seams, hems, collars, pockets and buttons, folds tighter than 1 cm,
-  creases that the cloth remembers, fingers that press into it, the mistakes of matching real images,
-  lens distortion, shadows, swinging while the wrist turns. Real items will do worse in ways that
-  only real recordings can show.
+  creases that the cloth remembers, fingers that press into it, the mistakes of matching real
+  images, lens distortion, shadows, swinging while the wrist turns. Real items will do worse in ways
+  that only real recordings can show.
 - **The two views and the points** were chosen by a program that knows the truth: the two views that
   together show most of one side, and five points seen in both, exact to 2.5 mm. A person would not
   be so exact. The two views still show only 82 to 91 % of that side.

@@ -24,6 +24,7 @@ from vflatten_ros.core.values import FlatGarment, Float, View
 BLUE, ORANGE, VERMILION, GREEN = "#0072B2", "#E69F00", "#D55E00", "#009E73"
 PURPLE, SKY, INK, CLOTH = "#CC79A7", "#56B4E9", "#333333", "#E3ECF3"
 VIEW_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILION)
+FLAT_COLOURS = "cividis"  # by u in the flat plane
 VIEWS_SHOWN = 4
 DOTS_3D = 9000
 LINES_SHOWN = 40
@@ -60,7 +61,7 @@ def draw_figures(
         "geodesics": geodesics_figure(garment, shown),
         "flattening": flattening_figure(garment),
         "category": category_figure(garment, templates),
-        "summary": summary_figure(garment, shown),
+        "summary": summary_figure(garment, views),
     }
     paths = []
     for name, figure in figures.items():
@@ -93,7 +94,7 @@ def draw_view(ax: Axes, garment: FlatGarment, view: View, colour: str) -> None:
     faded = 0.45 + 0.55 * _shade(view)
     ax.scatter(x, y, s=2.0, c=faded, marker="s", linewidths=0, rasterized=True)
     own = (garment.points.view_id == view.view_id) & (garment.points.pixel[:, 0] >= 0)
-    at = CM * _places(view, garment.points.pixel[own])
+    at = CM * view.points_view[_rows(view, garment.points.pixel[own])[0]]
     size = float(np.clip(3000 / max(len(at), 1), 3.0, 9.0))
     ax.scatter(at[:, 0], at[:, 1], s=size, c=colour, linewidths=0)
     for letter, place in _lettered(garment, view):
@@ -125,7 +126,7 @@ def geodesics_figure(garment: FlatGarment, views: Sequence[View]) -> Figure:
         total, flagged = len(chosen), int(lines.flagged[chosen].sum())
         ax.set_title(f"{name}: some of {total} geodesic lines\n({flagged} flagged, orange)")
     if not panels:
-        figure.text(0.5, 0.5, "no geodesic lines kept", ha="center")
+        _draw_hanging(figure, garment)
     return figure
 
 
@@ -151,6 +152,22 @@ def _draw_lines(
         axis.set_label_text(f"{name} (cm)")
         axis.labelpad = 16 if name == "y" else 6
         axis.set_tick_params(pad=6 if name == "y" else 2)
+
+
+def _draw_hanging(figure: Figure, garment: FlatGarment) -> None:
+    """Where no lines were kept: the hanging points from two sides, coloured by their flat place."""
+    figure.set_size_inches(9.2, 6.2)
+    seen = garment.points.view_id >= 0
+    step = max(1, int(seen.sum()) // DOTS_3D)
+    x, y, z = CM * garment.points.xyz_hanger[seen][::step].T
+    for k, side in enumerate((0, 180)):
+        ax: Any = figure.add_subplot(1, 2, k + 1, projection="3d")
+        u = garment.points.uv[seen][::step, 0]
+        ax.scatter(x, y, z, s=2, c=u, cmap=FLAT_COLOURS, linewidths=0, depthshade=False)
+        ax.set_box_aspect([max(float(np.ptp(v)), 1.0) if len(v) else 1.0 for v in (x, y, z)])
+        ax.view_init(elev=14, azim=side)
+        ax.set_axis_off()
+        ax.set_title(f"hanging, from {side}°; colour: u when flat")
 
 
 def _long_ones(garment: FlatGarment, chosen: Any) -> Any:
@@ -187,22 +204,11 @@ def draw_stress(ax: Axes, garment: FlatGarment) -> None:
 
 def draw_flat(ax: Axes, garment: FlatGarment) -> None:
     """The flattened item: cloth, points by view, outline seen or inferred, W and L."""
-    outline = CM * garment.outline.uv
-    if len(outline) >= 3:
-        ax.fill(*outline.T, color=CLOTH, zorder=0)
-        closed = np.concatenate([outline, outline[:1]])
-        ends = np.stack([closed[:-1], closed[1:]], axis=1)
-        for inferred, colour, name in ((False, INK, "outline, seen"), (True, ORANGE, "inferred")):
-            part = ends[garment.outline.inferred == inferred]
-            style = "dashed" if inferred else "solid"
-            if len(part):
-                ax.add_collection(
-                    LineCollection(list(part), colors=colour, lw=2, ls=style, label=name)
-                )
+    if len(garment.outline.uv) >= 3:
+        ax.fill(*(CM * garment.outline.uv.T), color=CLOTH, zorder=0)
+    draw_outline(ax, garment)
     _dots(ax, garment, garment.points.uv)
-    for measurement in garment.measurements:
-        if measurement.name in ("width", "length") and measurement.ends_uv is not None:
-            _draw_size(ax, measurement.name[0].upper(), measurement.value_m, measurement.ends_uv)
+    draw_sizes(ax, garment)
     for mark in garment.landmarks:
         ax.plot(CM * mark.uv[0], CM * mark.uv[1], "D", ms=4, color=PURPLE, zorder=4)
     if garment.landmarks:
@@ -211,13 +217,37 @@ def draw_flat(ax: Axes, garment: FlatGarment) -> None:
     _cm_axes(ax, "u (cm)", "v (cm)")
 
 
+def draw_outline(ax: Axes, garment: FlatGarment) -> None:
+    """Outline of the flattened item: solid where seen, dashed where inferred."""
+    if len(garment.outline.uv) < 3:
+        return
+    outline = CM * garment.outline.uv
+    closed = np.concatenate([outline, outline[:1]])
+    ends = np.stack([closed[:-1], closed[1:]], axis=1)
+    for inferred, colour, name in ((False, INK, "outline, seen"), (True, ORANGE, "inferred")):
+        part = ends[garment.outline.inferred == inferred]
+        style = "dashed" if inferred else "solid"
+        if len(part):
+            ax.add_collection(LineCollection(list(part), colors=colour, lw=2, ls=style, label=name))
+
+
+def draw_sizes(ax: Axes, garment: FlatGarment) -> None:
+    """W and L as arrows."""
+    for measurement in garment.measurements:
+        if measurement.name in ("width", "length") and measurement.ends_uv is not None:
+            _draw_size(ax, measurement.name[0].upper(), measurement.value_m, measurement.ends_uv)
+
+
 def _dots(ax: Axes, garment: FlatGarment, uv: Float) -> None:
     """Points in the plane, a colour a view where the views are few."""
     points = garment.points
     ids = [i for i in garment.view_ids if (points.view_id == i).any()]
     size = 14 if len(uv) < 1500 else 2.5
     if len(ids) > len(VIEW_COLOURS):
-        ax.scatter(*(CM * uv[points.view_id >= 0].T), s=size, c=SKY, lw=0, label="seen points")
+        seen = points.view_id >= 0
+        u, v = CM * uv[seen].T
+        colour = points.uv[seen, 0]
+        ax.scatter(u, v, s=size, c=colour, cmap=FLAT_COLOURS, alpha=0.5, lw=0, label="seen points")
     else:
         for view_id, colour in zip(sorted(ids), VIEW_COLOURS, strict=False):
             own = points.view_id == view_id
@@ -303,18 +333,39 @@ def draw_scores(ax: Axes, garment: FlatGarment) -> None:
 def summary_figure(garment: FlatGarment, views: Sequence[View]) -> Figure:
     """Views of the hanging item, then what it would look like laid flat."""
     figure = Figure(figsize=(12.0, 5.2), layout="constrained")
-    shown = list(views)[:3]
+    shown = shown_views(garment, views)[:3]
     grid = figure.add_gridspec(1, len(shown) + 1, width_ratios=[1.0] * len(shown) + [2.2])
     for k, view in enumerate(shown):
         ax = figure.add_subplot(grid[k])
         x, y, _ = CM * view.points_view.T
-        ax.scatter(x, y, s=1.5, c=_shade(view), marker="s", linewidths=0, rasterized=True)
+        ax.scatter(x, y, s=2.0, c=_shade(view), marker="s", linewidths=0, rasterized=True)
         ax.set_title(f"seen at {np.degrees(view.angle_rad):.0f}°")
         _cm_axes(ax, "cm", "cm" if k == 0 else "")
     flat = figure.add_subplot(grid[-1])
-    draw_flat(flat, garment)
-    flat.set_title(_title(garment))
+    if len(garment.view_ids) <= len(VIEW_COLOURS):
+        draw_cloth(flat, garment, views)
+    else:  # the colours of front and back would mix
+        draw_flat(flat, garment)
+    flat.set_title(_title(garment), fontsize=11)
     return figure
+
+
+def draw_cloth(ax: Axes, garment: FlatGarment, views: Sequence[View]) -> None:
+    """The flattened item in the colours of its cloth, with outline, W and L."""
+    places, colours = [np.empty((0, 2))], [np.empty((0, 3))]
+    for view in views:
+        own = garment.points.view_id == view.view_id
+        index, known = _rows(view, garment.points.pixel[own])
+        places.append(garment.points.uv[own][known])
+        colours.append(_shade(view)[index])
+    colour = np.concatenate(colours)
+    bright = np.argsort(colour.sum(axis=1), kind="stable")  # what faces its camera goes on top
+    u, v = CM * np.concatenate(places)[bright].T
+    size = float(np.clip(4e4 / max(len(u), 1), 4.0, 20.0))
+    ax.scatter(u, v, s=size, c=colour[bright], marker="s", lw=0, rasterized=True)
+    draw_outline(ax, garment)
+    draw_sizes(ax, garment)
+    _cm_axes(ax, "u (cm)", "v (cm)")
 
 
 def _row(figure: Figure, count: int) -> list[Axes]:
@@ -367,15 +418,15 @@ def _shade(view: View) -> Any:
     return np.repeat(0.45 + 0.45 * near[:, None], 3, axis=1)
 
 
-def _places(view: View, pixel: Any) -> Float:
-    """(n, 3) points of some pixels in the view frame; pixels that the view lacks are left out."""
+def _rows(view: View, pixel: Any) -> tuple[Any, Any]:
+    """Rows of a view's points at some pixels, and which of the pixels the view has."""
     width = view.shape[1]
     keys = view.pixel[:, 0].astype(np.int64) * width + view.pixel[:, 1]
     order = np.argsort(keys)
     wanted = pixel[:, 0] * width + pixel[:, 1]
-    slot = np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)
-    index = order[slot]
-    return view.points_view[index[keys[index] == wanted]]
+    index = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
+    known = keys[index] == wanted
+    return index[known], known
 
 
 def _lettered(garment: FlatGarment, view: View) -> list[tuple[str, Float]]:
@@ -384,8 +435,9 @@ def _lettered(garment: FlatGarment, view: View) -> list[tuple[str, Float]]:
     for letter, pair in zip(ascii_uppercase, garment.correspondences, strict=False):
         sides = ((pair.view_a, pair.pixel_a), (pair.view_b, pair.pixel_b))
         for view_id, pixel in sides:
-            place = _places(view, np.array([pixel])) if view_id == view.view_id else []
-            found += [(letter, row) for row in place]
+            if view_id == view.view_id:
+                index, _ = _rows(view, np.array([pixel]))
+                found += [(letter, place) for place in view.points_view[index]]
     return found
 
 

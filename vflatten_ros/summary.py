@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from vflatten_ros.core.buffer import DROP_REASONS
 from vflatten_ros.core.values import FlatGarment, Measurement
@@ -49,11 +49,24 @@ def _size(measurement: Measurement) -> str:
 
 
 def _used(garment: FlatGarment) -> str:
-    ids = ", ".join(str(i) for i in garment.view_ids)
+    ids = _ranges(garment.view_ids)
     pairs = len(garment.correspondences)
     given = sum(pair.manual for pair in garment.correspondences)
     points = f"; {pairs} corresponding points, {given} given by hand" if pairs else ""
     return f"method {garment.method}, views {ids}{points}"
+
+
+def _ranges(ids: Sequence[int]) -> str:
+    """1, 2, 3, 7 -> "1-3, 7"."""
+    runs: list[list[int]] = []
+    for i in sorted(ids):
+        if runs and i == runs[-1][-1] + 1:
+            runs[-1].append(i)
+        else:
+            runs.append([i])
+    return ", ".join(
+        f"{run[0]}-{run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs
+    )
 
 
 def _times(seconds: Mapping[str, float]) -> str:

@@ -6,7 +6,8 @@ from garments import FIRST_NS, example_garment, example_views
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from vflatten_ros.mcap_output import full_definition, result_messages, write_mcap
+from vflatten_ros.mcap_output import full_definition, write_mcap
+from vflatten_ros.outputs import result_messages
 
 VIEWS = example_views()
 GARMENT = example_garment(VIEWS)

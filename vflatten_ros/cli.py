@@ -170,7 +170,8 @@ def _write(args: argparse.Namespace, replayed: Replayed, stages: Stages) -> None
     """The files asked for; JSON last, as it tells the time of the others."""
     garment, views = replayed.garment, replayed.views
     if args.mcap:
-        from vflatten_ros.mcap_output import result_messages, write_mcap
+        from vflatten_ros.mcap_output import write_mcap
+        from vflatten_ros.outputs import result_messages
 
         stages("mcap", 0.0)
         write_mcap(args.mcap, result_messages(garment, views))

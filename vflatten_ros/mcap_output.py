@@ -6,19 +6,17 @@ The bytes depend on the messages alone: log times are the messages' own stamps.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer
 
-from vflatten_ros import displays, messages, resources
-from vflatten_ros.core.values import FlatGarment, View
-from vflatten_ros.messages import Fields
+from vflatten_ros import resources
 from vflatten_ros.output_files import whole_file
-from vflatten_ros.picture import draw_flat
+from vflatten_ros.outputs import Message
 
 _BUILT_IN = re.compile(r"(bool|byte|char|w?string|u?int(8|16|32|64)|float(32|64))(<=\d+)?")
 _FIELD = re.compile(r"(?P<type>[A-Za-z][\w/]*)(<=\d+)?(\[[^\]]*\])?\s+[A-Za-z]\w*\s*(?P<equals>=)?")
@@ -59,40 +57,6 @@ STANDARD: Mapping[str, str] = {
     ),
     "visualization_msgs/MarkerArray": "Marker[] markers\n",
 }
-
-
-class Message(NamedTuple):
-    """One message to write."""
-
-    topic: str
-    type: str  # "package/Name"
-    stamp_ns: int
-    fields: Fields
-
-
-def result_messages(garment: FlatGarment, views: Sequence[View]) -> list[Message]:
-    """What the node would publish, on the node's topics."""
-    fields: dict[str, tuple[str, Fields]] = {
-        "flattened_view": (
-            "vflatten_ros/FlattenedView",
-            messages.flattened_view_fields(garment, views),
-        ),
-        "garment": (
-            "vflatten_ros/GarmentEstimate",
-            messages.garment_estimate_fields(garment, views),
-        ),
-        "contour": ("geometry_msgs/PolygonStamped", displays.contour_fields(garment)),
-        "markers": ("visualization_msgs/MarkerArray", displays.marker_fields(garment, views)),
-        "points": ("sensor_msgs/PointCloud2", displays.points_fields(garment, views)),
-        "image": (
-            "sensor_msgs/Image",
-            displays.image_fields(draw_flat(garment), garment.stamp_ns),
-        ),
-    }
-    return [
-        Message(f"/vflatten/{name}", kind, garment.stamp_ns, values)
-        for name, (kind, values) in fields.items()
-    ]
 
 
 def definition(name: str) -> str:

@@ -7,11 +7,11 @@ from garments import example_garment, example_views
 from mcap.reader import make_reader
 from rclpy.serialization import deserialize_message, serialize_message
 
-from vflatten_ros import displays, mcap_output, messages
+from vflatten_ros import displays, mcap_output, messages, outputs
 
 VIEWS = example_views()
 GARMENT = example_garment(VIEWS)
-RESULTS = mcap_output.result_messages(GARMENT, VIEWS)
+RESULTS = outputs.result_messages(GARMENT, VIEWS)
 
 
 def class_of(name):

@@ -1,0 +1,45 @@
+"""What a result is published as: the same messages by the node and in `vflatten replay --mcap`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from vflatten_ros import displays, messages
+from vflatten_ros.core.values import FlatGarment, View
+from vflatten_ros.messages import Fields
+from vflatten_ros.picture import draw_flat
+
+
+class Message(NamedTuple):
+    """One message to write."""
+
+    topic: str
+    type: str  # "package/Name"
+    stamp_ns: int
+    fields: Fields
+
+
+def result_messages(garment: FlatGarment, views: Sequence[View]) -> list[Message]:
+    """What the node would publish, on the node's topics."""
+    fields: dict[str, tuple[str, Fields]] = {
+        "flattened_view": (
+            "vflatten_ros/FlattenedView",
+            messages.flattened_view_fields(garment, views),
+        ),
+        "garment": (
+            "vflatten_ros/GarmentEstimate",
+            messages.garment_estimate_fields(garment, views),
+        ),
+        "contour": ("geometry_msgs/PolygonStamped", displays.contour_fields(garment)),
+        "markers": ("visualization_msgs/MarkerArray", displays.marker_fields(garment, views)),
+        "points": ("sensor_msgs/PointCloud2", displays.points_fields(garment, views)),
+        "image": (
+            "sensor_msgs/Image",
+            displays.image_fields(draw_flat(garment), garment.stamp_ns),
+        ),
+    }
+    return [
+        Message(f"/vflatten/{name}", kind, garment.stamp_ns, values)
+        for name, (kind, values) in fields.items()
+    ]

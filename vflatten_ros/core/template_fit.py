@@ -18,7 +18,9 @@ from vflatten_ros.core.templates import Float, Template
 Int = NDArray[np.int64]
 
 MISSING = 0.8  # where residuals level off, in cuts: cloth that is missing is easily believed,
-OUTSIDE = 2.0  # cloth that is too much is not
+OUTSIDE = 1.5  # cloth that is too much is not
+WIDE = np.radians(20.0)  # parts that swing farther start spread, too
+SPREADS = np.radians([35.0, 75.0])
 FACING_M = 0.03  # how much farther an edge counts that faces across
 
 
@@ -70,7 +72,15 @@ def starts(template: Template, evidence: Evidence, rotations: int) -> tuple[Floa
     cos, sin = np.cos(angle), np.sin(angle)
     turned = np.stack([cos * centre[0] - sin * centre[1], sin * centre[0] + cos * centre[1]], -1)
     poses = np.column_stack([angle, seen_centre - turned])
-    return poses, np.tile(state, (rotations, 1))
+    states = [state]
+    wide = np.flatnonzero(template.swing > WIDE)
+    for turn in SPREADS if len(wide) else ():
+        spread = state.copy()
+        first = len(template.sizes) + len(template.parts)
+        for side in (0, len(template.parts)):
+            spread[first + side + wide] = turn / template.swing[wide]
+        states.append(spread)
+    return np.tile(poses, (len(states), 1)), np.repeat(states, rotations, axis=0)
 
 
 def _moments(outline: Float) -> tuple[float, Float]:

@@ -21,6 +21,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 _TERM = re.compile(r"([+-]?)(?:(\d+\.?\d*|\.\d+)\*?)?([A-Za-z_]\w*)?")
+MOST_BEND = np.radians(110.0)  # of an outline at a joint
 _KEYS = {"category", "sizes", "parts", "half", "landmarks", "measurements", "order"}
 
 
@@ -45,6 +46,7 @@ class Template:
     fixed: Float  # (p, 2, s) right half: coordinates per size, of the pivot for points of a part
     turned: Float  # (p, 2, s) coordinates from the pivot per size, before turning
     part: Int  # (p,) index of the point's part, -1: none
+    bend: NDArray[np.bool_]  # (p,) on the mitre between its part and the body
     side: Float  # (p,) 1 right or middle, -1 left: mirrored
     paths: Mapping[str, tuple[Int, ...]]  # measurement -> its path, and its mirror image
     order: tuple[str, ...]  # measurements that ascend by definition
@@ -95,12 +97,10 @@ class Template:
                 + state[..., n + index] * self.spread[index]
                 + state[..., own] * self.swing[index]
             )
-            cos, sin = np.cos(angle), np.sin(angle)
-            turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
-            arm = np.einsum("...pij,...pj->...pi", turn, arm)
-            points = points + arm
-            slope[..., :n] += np.einsum("...pij,...pjt->...pit", turn, grow)
-            across = np.stack([-arm[..., 1], arm[..., 0]], -1)
+            matrix, change = _turn(angle, self.bend)
+            points = points + np.einsum("...pij,...pj->...pi", matrix, arm)
+            slope[..., :n] += np.einsum("...pij,...pjt->...pit", matrix, grow)
+            across = np.einsum("...pij,...pj->...pi", change, arm)
             every = np.arange(len(self.points))
             for column, scale in ((n + index, self.spread[index]), (own, self.swing[index])):
                 columns = np.moveaxis(slope, (-3, -1), (0, 1))  # view: (p, m, ..., 2)
@@ -142,6 +142,22 @@ class Template:
             name: (value, float(np.sqrt(max(row @ covariance @ row, 0.0))))
             for name, (value, row) in found.items()
         }
+
+
+def _turn(angle: Float, bend: NDArray[np.bool_]) -> tuple[Float, Float]:
+    """(..., p, 2, 2) rotations and their derivatives; to the mitre where the outline bends.
+
+    The mitre of two edges at a distance from their common pivot lies at half the angle between
+    them, farther away by 1 / cos of it: the matrix is I + tan(angle / 2) J.
+    """
+    half = np.tan(0.5 * np.clip(angle, -MOST_BEND, MOST_BEND))
+    one, none = np.ones_like(angle), np.zeros_like(angle)
+    cos, sin = np.where(bend, one, np.cos(angle)), np.where(bend, half, np.sin(angle))
+    cos_slope = np.where(bend, none, -np.sin(angle))
+    sin_slope = np.where(bend, 0.5 * (1.0 + half**2), np.cos(angle))
+    matrix = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    change = np.stack([np.stack([cos_slope, -sin_slope], -1), np.stack([sin_slope, cos_slope], -1)], -2)
+    return matrix, change
 
 
 def _path(path: Int, points: Float, slope: Float) -> tuple[float, Float]:
@@ -198,7 +214,7 @@ class _Reader:
         self.sizes: list[str] = list(data["sizes"])
         self.parts: list[str] = list(data.get("parts") or {})
         self.names: list[str] = []
-        self.rows: list[tuple[Float, Float, int, float]] = []  # fixed, turned, part, side
+        self.rows: list[tuple[Float, Float, int, bool, float]] = []  # fixed, turned, part, bend, side
 
     def template(self, name: str) -> Template:
         log_typical, log_spread = self.spreads()
@@ -215,7 +231,7 @@ class _Reader:
         if not set(order) <= set(paths):
             raise InvalidConfig(f"order names a measurement that is not there: {order}")
         parts = [self.data["parts"][p] for p in self.parts]
-        fixed, turned, part, side = zip(*self.rows)
+        fixed, turned, part, bend, side = zip(*self.rows)
         template = Template(
             category=name,
             sizes=tuple(self.sizes),
@@ -231,6 +247,7 @@ class _Reader:
             fixed=np.array(fixed),
             turned=np.array(turned),
             part=np.array(part, dtype=np.int64),
+            bend=np.array(bend, dtype=bool),
             side=np.array(side),
             paths=paths,
             order=order,
@@ -278,22 +295,22 @@ class _Reader:
         self.add(f"right_{point['name']}", row, 1.0)
         self.add(f"left_{point['name']}", row, -1.0)
 
-    def add(self, name: str, row: tuple[Float, Float, int], side: float) -> None:
+    def add(self, name: str, row: tuple[Float, Float, int, bool], side: float) -> None:
         if name and name in self.names:
             raise InvalidConfig(f"point {name!r} is described twice")
         self.names.append(name)
         self.rows.append((*row, side))
 
-    def point(self, point: Mapping[str, Any]) -> tuple[Float, Float, int]:
+    def point(self, point: Mapping[str, Any]) -> tuple[Float, Float, int, bool]:
         at = np.array([self.sum(value) for value in point["at"]])
         if at.shape != (2, len(self.sizes)):
             raise InvalidConfig(f"at: expected [u, v], got {point['at']!r}")
         if point.get("part") is None:
-            return at, np.zeros_like(at), -1
+            return at, np.zeros_like(at), -1, False
         if point["part"] not in self.parts:
             raise InvalidConfig(f"no part {point['part']!r} among {self.parts}")
         pivot = self.data["parts"][point["part"]]["pivot"]
-        return np.array([self.sum(v) for v in pivot]), at, self.parts.index(point["part"])
+        return np.array([self.sum(v) for v in pivot]), at, self.parts.index(point["part"]), bool(point.get("bend", False))
 
     def sum(self, value: Any) -> Float:
         """Coefficients of the sizes in '0.5 * waist - height' or 0."""

@@ -98,9 +98,10 @@ def draw_view(ax: Axes, garment: FlatGarment, view: View, colour: str) -> None:
     size = float(np.clip(3000 / max(len(at), 1), 3.0, 9.0))
     ax.scatter(at[:, 0], at[:, 1], s=size, c=colour, linewidths=0)
     for letter, place in _lettered(garment, view):
-        ax.plot(*(CM * place[:2]), "o", ms=8, mfc="none", mec=VERMILION, mew=2)
+        x_cm, y_cm = (CM * place[:2]).tolist()
+        ax.plot(x_cm, y_cm, "o", ms=8, mfc="none", mec=VERMILION, mew=2)
         ax.annotate(
-            letter, CM * place[:2], (7, 5), textcoords="offset points", color=VERMILION,
+            letter, (x_cm, y_cm), (7, 5), textcoords="offset points", color=VERMILION,
             fontweight="bold", fontsize=12, path_effects=_halo(),
         )  # fmt: skip
     _cm_axes(ax, "x (cm)", "y, up (cm)")
@@ -250,11 +251,12 @@ def _dots(ax: Axes, garment: FlatGarment, uv: Float) -> None:
         ax.scatter(u, v, s=size, c=colour, cmap=FLAT_COLOURS, alpha=0.5, lw=0, label="seen points")
     else:
         for view_id, colour in zip(sorted(ids), VIEW_COLOURS, strict=False):
-            own = points.view_id == view_id
-            ax.scatter(*(CM * uv[own].T), s=size, c=colour, lw=0, label=f"view {view_id}", zorder=2)
+            u, v = CM * uv[points.view_id == view_id].T
+            ax.scatter(u, v, s=size, c=colour, lw=0, label=f"view {view_id}", zorder=2)
     unseen = points.view_id < 0
     if unseen.any():
-        ax.scatter(*(CM * uv[unseen].T), s=size, c="#999999", lw=0, label="in no view")
+        u, v = CM * uv[unseen].T
+        ax.scatter(u, v, s=size, c="#999999", lw=0, label="in no view")
 
 
 def _draw_size(ax: Axes, letter: str, value_m: float, ends_uv: Any) -> None:

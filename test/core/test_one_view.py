@@ -1,0 +1,69 @@
+"""One view alone: a bent sheet comes out as the rectangle that it is."""
+
+import numpy as np
+import pytest
+from garments import BELOW_TIP_M, CALIBRATION, HEIGHT_M, RADIUS_M, WIDTH_M, example_view
+
+from vflatten_ros.core.config import Config
+from vflatten_ros.core.errors import DisconnectedSurface
+from vflatten_ros.core.geometry import transform_points
+from vflatten_ros.core.one_view import flatten_one_view
+from vflatten_ros.core.values import View
+
+
+def seen_by_camera(rows=480, cols=360, focal=520.0):
+    """The towel of garments.py, exactly where the camera's rays meet it, and its flat places."""
+    # rays against the cylinder x^2 + y^2 = r^2 in the hanger frame at item angle 0
+    T_rig_hanger = CALIBRATION.T_rig_hanger(0.0)
+    row, col = (v.ravel() for v in np.mgrid[0:rows, 0:cols])
+    ray = np.c_[(col - (cols - 1) / 2) / focal, (row - (rows - 1) / 2) / focal, np.ones(len(row))]
+    eye = -T_rig_hanger[:3, :3].T @ T_rig_hanger[:3, 3]
+    way = ray @ T_rig_hanger[:3, :3]
+    a, b = (way[:, :2] ** 2).sum(1), way[:, :2] @ eye[:2]
+    root = b**2 - a * (eye[:2] @ eye[:2] - RADIUS_M**2)
+    met = root > 0
+    depth = (-b[met] - np.sqrt(root[met])) / a[met]
+    at = eye + depth[:, None] * way[met]
+    u, v = RADIUS_M * np.arctan2(at[:, 1], at[:, 0]), at[:, 2] + BELOW_TIP_M
+    inside = (np.abs(u) < WIDTH_M / 2) & (v < 0) & (v > -HEIGHT_M)
+    pixel = np.c_[row[met], col[met]][inside].astype(np.int32)
+    points = transform_points(T_rig_hanger, at[inside])
+    flat = np.c_[u, v][inside]
+    return View(3, 0, 0.0, points, pixel, None, (rows, cols), CALIBRATION), flat
+
+
+def test_a_bent_sheet_comes_out_as_its_rectangle():
+    view, flat = seen_by_camera()
+    done = flatten_one_view(view, Config())
+    assert len(done.points.uv) > 200
+    # the sheet turns away at its sides: a pixel there is 5 mm of cloth
+    assert np.ptp(done.outline.uv, axis=0) == pytest.approx([WIDTH_M, HEIGHT_M], abs=0.006)
+    # every point within a millimetre of its true place, turned and shifted as a whole
+    true = {tuple(p): uv for p, uv in zip(view.pixel.tolist(), flat, strict=True)}
+    goal = np.array([true[tuple(p)] for p in done.points.pixel.tolist()])
+    a, b = done.points.uv - done.points.uv.mean(0), goal - goal.mean(0)
+    left, _, right = np.linalg.svd(a.T @ b)
+    assert np.linalg.norm(a @ left @ right - b, axis=1).max() < 0.001
+    assert np.linalg.det(left @ right) > 0  # as the rig sees it, not mirrored
+    assert set(done.points.view_id.tolist()) == {3}
+    assert len(done.lines.length_m) > 10
+    assert done.notices == ()
+
+
+def test_it_lies_as_it_hangs():
+    view, _ = seen_by_camera()
+    done = flatten_one_view(view, Config())
+    height = view.points_view[:, 1]
+    rows = {tuple(p): i for i, p in enumerate(view.pixel.tolist())}
+    hanging = height[[rows[tuple(p)] for p in done.points.pixel.tolist()]]
+    assert np.corrcoef(done.points.uv[:, 1], hanging)[0, 1] > 0.999
+
+
+def test_a_few_specks_are_refused():
+    view = example_view(0, 0.0)
+    few = np.arange(0, len(view.points_rig), len(view.points_rig) // 20)
+    specks = View(
+        0, 0, 0.0, view.points_rig[few], view.pixel[few], None, view.shape, view.calibration
+    )
+    with pytest.raises(DisconnectedSurface, match="largest piece of cloth"):
+        flatten_one_view(specks, Config())

@@ -285,13 +285,22 @@ class FlatteningConfig(Checked):
 class AssemblyConfig(Checked):
     """Placing pieces that hidden folds part from the rest, by the category's outline."""
 
-    categories: int = option(
-        2, "Likeliest categories for which loose pieces are placed; 0: they are left out.", low=0, high=100
-    )
     rotations: int = option(72, "Rotations tried.", low=4, high=3600)
-    hinges: int = option(4, "Places tried where two pieces touch.", low=1, high=100)
+    hinges: int = option(5, "Places tried for the tip of a fold between two pieces.", low=1, high=100)
+    tip_m: float = option(
+        0.16, "The tip of a fold may be so far beyond where its sides are seen, m.", low=0.0, high=1.0
+    )
+    categories: int = option(
+        4, "Likeliest categories for which pieces are placed with care.", low=1, high=100
+    )
+    alternations: int = option(
+        4, "Times that pieces are placed and the outline is fitted, in turns; 0: not.", low=0, high=100
+    )
     touch_m: float = option(
         0.012, "Cloth this near as it hangs may touch, m.", low=0.001, high=0.1
+    )
+    overlap_m: float = option(
+        0.004, "Pieces may overlap by so much in the plane, m.", low=0.0, high=0.1
     )
     hinge_m: float = option(
         0.02, "How far from there the pieces may meet in the plane, one sigma, m.", low=0.001, high=0.5
@@ -303,7 +312,10 @@ class AssemblyConfig(Checked):
         6.0, "Independent observations that a piece's ends count for.", low=0.0, high=1000.0
     )
     inner_weight: float = option(
-        6.0, "The same for its cloth, which must be inside and beside other cloth.", low=0.0, high=1000.0
+        6.0, "The same for its cloth, which must be inside the outline.", low=0.0, high=1000.0
+    )
+    overlap_weight: float = option(
+        60.0, "The same for its cloth, which must not lie on other cloth.", low=0.0, high=10000.0
     )
     sigma_m: float = option(
         0.006, "Error of the outline where pieces were placed, one sigma, m.", low=0.0, high=0.1

@@ -20,7 +20,7 @@ from vflatten_ros.core.fusion import Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.registration import ViewSurface, register_views, view_surface
 from vflatten_ros.core.sheets import Links, link_samples
-from vflatten_ros.core.unfolding import orientation, place_samples, unfold
+from vflatten_ros.core.unfolding import carry, orientation, place_samples, settle, unfold
 from vflatten_ros.core.values import (
     Correspondence,
     FlatPoints,
@@ -37,18 +37,6 @@ CELL_M = 0.002  # of the image whose contour is the outline
 
 
 @dataclass(frozen=True, eq=False)
-class Unfolded:
-    """The visible surface, flattened."""
-
-    points: FlatPoints  # one measured point near each sample
-    side: Float  # (n,) 1 outside up, -1 outside down, 0 unclear
-    outline: Outline
-    start_uv: Float  # (n, 2)
-    stress_m: float  # rms excess over the distances
-    notices: tuple[Notice, ...]
-
-
-@dataclass(frozen=True, eq=False)
 class Surface:
     """Samples of the whole visible surface, linked, and distances along it."""
 
@@ -57,6 +45,20 @@ class Surface:
     distances: Distances
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Unfolded:
+    """The visible surface, flattened."""
+
+    surface: Surface
+    plane: Float  # (k, 2) places of the surface's landmarks
+    points: FlatPoints  # one measured point near each sample
+    side: Float  # (n,) 1 outside up, -1 outside down, 0 unclear
+    outline: Outline
+    start_uv: Float  # (n, 2)
+    stress_m: float  # rms excess over the distances
+    notices: tuple[Notice, ...]
 
 
 def unfold_views(
@@ -82,13 +84,26 @@ def unfold_views(
     NotEnoughViews, DisconnectedSurface
     """
     surface = whole_surface(views, config, progress, prepared or {})
-    distances, samples, links = surface.distances, surface.samples, surface.links
+    distances = surface.distances
     plane = unfold(distances.bound_m, distances.same_sheet, config, progress)
     progress("outline", 0.0)
-    uv, misfit = place_samples(
-        distances.around, distances.around_m, distances.around_sheet, plane
-    )
-    return _unfolded(surface, uv, misfit, config)
+    return _unfolded(surface, plane, config)
+
+
+def turn_parts(
+    unfolded: Unfolded, swung: Float, rest: Float, config: RotationConfig
+) -> Unfolded:
+    """The same surface with its loose parts (legs, sleeves) turned as a template says.
+
+    Parameters
+    ----------
+    swung, rest : ndarray of shape (k, 2)
+        The template's outline as it fits the item, and with its parts at rest.
+    """
+    distances = unfolded.surface.distances
+    plane = carry(unfolded.plane, swung, rest)
+    plane = settle(plane, distances.bound_m, distances.same_sheet, config)
+    return _unfolded(unfolded.surface, plane, config)
 
 
 def whole_surface(
@@ -128,10 +143,13 @@ def whole_surface(
     return Surface(samples, links, distances, ids[of_view], pixel)
 
 
-def _unfolded(surface: Surface, uv: Float, misfit: Float, config: RotationConfig) -> Unfolded:
-    samples, links = surface.samples, surface.links
+def _unfolded(surface: Surface, plane: Float, config: RotationConfig) -> Unfolded:
+    samples, links, distances = surface.samples, surface.links, surface.distances
+    uv, misfit = place_samples(
+        distances.around, distances.around_m, distances.around_sheet, plane
+    )
     side = orientation(uv, samples.xyz, samples.normal, links.a, links.b)
-    placed = np.isfinite(uv).all(1) & surface.distances.inside
+    placed = np.isfinite(uv).all(1) & distances.inside
     points = FlatPoints(
         uv=uv[placed],
         xyz_hanger=samples.xyz[placed],
@@ -147,7 +165,7 @@ def _unfolded(surface: Surface, uv: Float, misfit: Float, config: RotationConfig
         text = f"distances contradict each other by {1e3 * stress:.0f} mm"
         notices.append(Notice("high_stress", text))
     outline = outline_of(points.uv, points.sigma_m, config)
-    return Unfolded(points, side[placed], outline, points.uv, stress, tuple(notices))
+    return Unfolded(surface, plane, points, side[placed], outline, points.uv, stress, tuple(notices))
 
 
 def outline_of(uv: Float, sigma_m: Float, config: RotationConfig) -> Outline:

@@ -14,6 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
+STAY = 1e-6  # weight of the present distance of every pair: keeps the equations regular
 SPREAD = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # weight of distances that fall short, in turn
 
 
@@ -22,30 +23,79 @@ def unfold(
 ) -> Float:
     """Plane coordinates that keep the bounds, keep near distances, and spread otherwise.
 
+    Parameters
+    ----------
+    bound : ndarray of shape (k, k)
+        Distances along the surface.
+    near : ndarray of shape (k, k)
+        Pairs that keep their distance both ways.
+
     Returns
     -------
     ndarray of shape (k, 2)
         Metres; position, rotation and mirror image are arbitrary but repeatable.
     """
     plane = _classical_scaling(bound)
-    rounds = [(spread, k) for spread in SPREAD for k in range(config.unfold_rounds)]
-    for done, (spread, _) in enumerate(rounds):
+    rounds = [spread for spread in SPREAD for _ in range(config.unfold_rounds)]
+    for done, spread in enumerate(rounds):
         progress("unfold", done / len(rounds))
         plane = _majorise(plane, bound, near, spread)
     return plane
+
+
+def settle(plane: Float, bound: Float, near: Bool, config: RotationConfig) -> Float:
+    """Keep bounds and near distances, from where the points are, without spreading any more."""
+    for _ in range(config.unfold_rounds):
+        plane = _majorise(plane, bound, near, 0.0)
+    return plane
+
+
+def carry(points: Float, before: Float, after: Float) -> Float:
+    """Carry points along with an outline that moves from `before` to `after`.
+
+    Each moves rigidly, as the outline around it does on average (Schaefer et al. 2006, image
+    deformation by moving least squares).
+
+    Parameters
+    ----------
+    points : ndarray of shape (n, 2)
+    before, after : ndarray of shape (k, 2)
+        Corresponding vertices of the closed outline.
+    """
+    start, end = _along(before), _along(after)
+    weight = 1 / (((points[:, None] - start) ** 2).sum(2) + 1e-4) ** 2
+    weight /= weight.sum(1, keepdims=True)
+    from_, to = weight @ start, weight @ end
+    p = (start - from_[:, None]) @ np.array([1, 1j])
+    q = (end - to[:, None]) @ np.array([1, 1j])
+    turn = (weight * p.conj() * q).sum(1)
+    turn /= np.maximum(np.abs(turn), 1e-12)
+    moved = turn * ((points - from_) @ np.array([1, 1j]))
+    return to + np.column_stack([moved.real, moved.imag])
+
+
+def _along(outline: Float, per_edge: int = 20) -> Float:
+    """Points along every edge of a closed outline, alike in number."""
+    share = (np.arange(per_edge) / per_edge)[:, None]
+    after = np.roll(outline, -1, axis=0)
+    points: Float = (outline[:, None] * (1 - share) + after[:, None] * share).reshape(-1, 2)
+    return points
 
 
 def _majorise(plane: Float, bound: Float, near: Bool, spread: float) -> Float:
     """Three steps of stress majorisation (de Leeuw 1977) under weights taken from the residuals."""
     k = len(plane)
     safe = np.where(bound > 0, bound, 1.0)
-    short = np.maximum(bound - _pairwise(plane), 0.0)
+    flat = _pairwise(plane)
+    short = np.maximum(bound - flat, 0.0)
     robust = np.maximum(spread, 1 / (1 + (short / (0.2 * safe)) ** 2))
-    weight = np.where(short > 0, np.where(near, robust, spread), 1.0) * (bound > 0) / safe**1.5
+    base = (bound > 0) / safe**1.5
+    weight = np.where(short > 0, np.where(near, robust, spread), 1.0) * base
+    target = weight * bound + STAY * base * flat  # a pair without any say stays where it is
+    weight = weight + STAY * base
     factor = cho_factor(np.diag(weight.sum(1)) - weight + 1 / k)  # 1/k: fixes the centroid
-    pull = weight * bound
     for _ in range(3):
-        ratio = pull / np.maximum(_pairwise(plane), 1e-9)
+        ratio = target / np.maximum(_pairwise(plane), 1e-9)
         plane = cho_solve(factor, ratio.sum(1)[:, None] * plane - ratio @ plane)
     return plane
 

@@ -9,6 +9,7 @@ from garments import example_garment, example_views
 
 from vflatten_ros import figures
 from vflatten_ros.categories import load_templates
+from vflatten_ros.plots_category import similarity
 
 VIEWS = example_views()
 GARMENT = example_garment(VIEWS)
@@ -80,6 +81,6 @@ def test_the_model_match_turns_the_outline_onto_the_model():
     model = next(t for t in TEMPLATES if t.category == "long_sleeve_shirt")
     typical = model.outline(np.zeros(model.dimensions))
     turn = np.array([[0.6, -0.8], [0.8, 0.6]]) @ np.diag([1.0, -1.0])
-    assert figures._similarity(1.3 * typical @ turn + 0.2, typical)(
+    assert similarity(1.3 * typical @ turn + 0.2, typical)(
         1.3 * typical @ turn + 0.2
     ) == pytest.approx(typical, abs=1e-9)

@@ -21,6 +21,7 @@ bootstrap:  ## Build the package; afterwards: source env.sh
 demo: bootstrap  ## Flatten a recorded garment: a table, and figures in build/demo (BAG=bags/TR1_1)
 	@$(IN_ENV) vflatten replay $(BAG) $(if $(PROTOCOL),--protocol $(PROTOCOL)) \
 	  --json build/demo/result.json --figures build/demo
+	@echo "figures in build/demo: $$(cd build/demo; echo *.png)"
 
 test: bootstrap  ## All tests, on the built package (TESTS="test/core -k plane" for some)
 	@$(IN_ENV) VFLATTEN_REQUIRE_ROS=1 pytest $(TESTS)

@@ -48,8 +48,13 @@ venv_key() {
 }
 
 install_locked() {
-  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps \
-    --requirement "$lock" || die "the packages of $lock could not be installed: see above"
+  local pip=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check
+    --require-hashes --no-deps --no-build-isolation --use-pep517)
+  # What has no wheel is built with the pinned setuptools, not with the newest.
+  awk '/^[a-z]/ { found = /^setuptools==/ } found' "$lock" > "$venv/setuptools.txt"
+  [ ! -s "$venv/setuptools.txt" ] || "${pip[@]}" --requirement "$venv/setuptools.txt" &&
+    "${pip[@]}" --requirement "$lock" ||
+    die "the packages of $lock could not be installed: see above"
 }
 
 make_venv() {
@@ -75,7 +80,7 @@ prepare_beside_ros() {
     "$venv/bin/python" -c 'import rclpy, numpy, scipy, cv2, matplotlib, yaml, tqdm, pytest' ) ||
     die "missing above; try: rosdep install --from-paths $root --ignore-src --rosdistro jazzy"
   # Debian's pytest command runs Debian's interpreter, which does not see .venv.
-  printf '#!%s\nimport pytest\nraise SystemExit(pytest.console_main())\n' "$venv/bin/python" \
+  printf '#!%s\nimport pytest\nraise SystemExit(pytest.main())\n' "$venv/bin/python" \
     > "$venv/bin/pytest"
   chmod +x "$venv/bin/pytest"
 }

@@ -28,6 +28,8 @@ class Layers:
     bridged: Bool  # (rows, cols) in a hole too large to trust: the surface is only guessed
     right: Bool  # (rows, cols) joined to the place to the right
     down: Bool  # (rows, cols) joined to the place below
+    smooth_right: Bool  # (rows, cols) no jump to the place to the right, though perhaps a gap
+    smooth_down: Bool  # (rows, cols)
     label: NDArray[np.int32]  # (rows, cols) number of the piece, -1: none
 
 
@@ -55,22 +57,23 @@ def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m:
     bridged = ~seen & ~small & (away > RING) & ~np.isin(holes, outside)
     valid = (away <= RING) | small | bridged
     across = np.where(small, 8.0, 3.0)
-    joined = []
+    smooth, joined = [], []
     for axis in (1, 0):
-        join = _joined(depth, seen, points, source, across, axis, cell_m, noise_m)
-        join |= bridged | np.roll(bridged, -1, axis=axis)
-        join &= valid & np.roll(valid, -1, axis=axis)
-        join[(slice(None), -1) if axis else -1] = False
-        joined.append(join)
+        near, close = _joined(depth, seen, points, source, across, axis, cell_m, noise_m)
+        near &= valid & np.roll(valid, -1, axis=axis)
+        near[(slice(None), -1) if axis else -1] = False
+        smooth.append(near)
+        joined.append(near & (close | bridged | np.roll(bridged, -1, axis=axis)))
     right, down = joined
-    return Layers(seen, valid, source, bridged, right, down, _label(valid, right, down))
+    label = _label(valid, right, down)
+    return Layers(seen, valid, source, bridged, right, down, smooth[0], smooth[1], label)
 
 
 def _joined(
     depth: Float, seen: Bool, points: Float, source: Int, across: Float, axis: int,
     cell_m: float, noise_m: float,
 ) -> Bool:  # fmt: skip
-    """Whether each place and the next along the axis are on one surface."""
+    """Whether each place and the next along the axis are on one surface, and measured near by."""
     flat = points.reshape(-1, 3)
     other = np.roll(source, -1, axis=axis)
     gap = np.linalg.norm(flat[source] - flat[other], axis=-1)
@@ -81,11 +84,11 @@ def _joined(
     both = seen & np.roll(seen, -1, axis=axis)
     # steeper places cannot be told from a jump where nothing was measured between
     near = gap < np.hypot(np.where(both, 6.0, 2.5) * cell_m * steps, 5.0 * noise_m)
-    near &= steps <= np.maximum(across, np.roll(across, -1, axis=axis))
+    close = steps <= np.maximum(across, np.roll(across, -1, axis=axis))
     limit = max(4.0 * noise_m, 1.2 * cell_m)
     # a jump is a line of places, noise is not
     step = (_step(depth, seen, axis, 3) > limit) & (_step(depth, seen, axis, 7) > limit / 2)
-    return np.asarray(near & ~step)
+    return np.asarray(near & ~step), np.asarray(close)
 
 
 def _step(depth: Float, seen: Bool, axis: int, across: int) -> Float:
@@ -127,7 +130,7 @@ def _label(valid: Bool, right: Bool, down: Bool) -> NDArray[np.int32]:
 
 
 def connected_window(layers: Layers, rows: Int, cols: Int, reach: int) -> Bool:
-    """Which places around each of k places are joined to it inside a window.
+    """Which places around each of k places no jump parts from it inside a window.
 
     Returns
     -------
@@ -135,7 +138,7 @@ def connected_window(layers: Layers, rows: Int, cols: Int, reach: int) -> Bool:
     """
     pad = reach + 1
     wide = layers.valid.shape[1] + 2 * pad
-    right, down = (np.pad(m, pad).ravel() for m in (layers.right, layers.down))
+    right, down = (np.pad(m, pad).ravel() for m in (layers.smooth_right, layers.smooth_down))
     here = (rows + pad) * wide + cols + pad
     size = 2 * reach + 1
     open_right = np.empty((size, size - 1, len(rows)), bool)

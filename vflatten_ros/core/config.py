@@ -177,7 +177,7 @@ class SurfaceConfig(Checked):
         "Local fit: 'linear' in (x, y) as the paper's, or 'quadratic' in the local tangent frame.",
         choices=("quadratic", "linear"),
     )
-    radius_m: float = option(0.0125, "Radius r0 of the local fit, m.", low=0.002, high=0.1)
+    radius_m: float = option(0.0115, "Radius r0 of the local fit, m.", low=0.002, high=0.1)
     along_rulings: bool = option(
         True, "Average the quadratic fit along the straight lines of the cloth."
     )
@@ -207,7 +207,7 @@ class PatchConfig(Checked):
         0.03, "Change of depth to the next pixel that is a step on any slope, m.", low=0.001, high=1.0
     )
     margin_px: int = option(
-        1, "Patches do not join through what is this near to a line of steps, pixels.", low=0, high=20
+        2, "Patches do not join through what is this near to a line of steps, pixels.", low=0, high=20
     )
     gap_px: int = option(
         5, "Where other cloth follows within this, a patch's end need not be the item's, pixels.", low=1, high=50
@@ -285,13 +285,13 @@ class FlatteningConfig(Checked):
 class AssemblyConfig(Checked):
     """Placing pieces that hidden folds part from the rest, by the category's outline."""
 
-    rotations: int = option(72, "Rotations tried.", low=4, high=3600)
+    rotations: int = option(60, "Rotations tried.", low=4, high=3600)
     hinges: int = option(5, "Places tried for the tip of a fold between two pieces.", low=1, high=100)
     tip_m: float = option(
         0.16, "The tip of a fold may be so far beyond where its sides are seen, m.", low=0.0, high=1.0
     )
     categories: int = option(
-        4, "Likeliest categories for which pieces are placed with care.", low=1, high=100
+        3, "Likeliest categories for which pieces are placed with care.", low=1, high=100
     )
     alternations: int = option(
         4, "Times that pieces are placed and the outline is fitted, in turns; 0: not.", low=0, high=100

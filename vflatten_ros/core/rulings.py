@@ -21,6 +21,7 @@ WINDOWS_M = (0.006, 0.012, 0.024, 0.040)  # standard deviations of the weight al
 STEP_M = 0.006
 REACH = 12  # samples to each side
 DIRECTION_M = 0.015  # the direction is averaged over so much, standard deviation
+AGREE_M = 0.02  # windows are judged over so much, standard deviation
 CHUNK = 20000
 
 
@@ -152,13 +153,19 @@ def _straight(
 
 
 def _blend(
-    fits: Float, variance: Float, rows: Int, cols: Int, estimates: Float, spread: Float, cell_m: float
+    fits: Float,
+    variance: Float,
+    rows: Int,
+    cols: Int,
+    estimates: Float,
+    spread: Float,
+    cell_m: float,
 ) -> tuple[Float, Float]:
     """Each window counts by the inverse square of its squared error: bias, from the data, and noise."""
     own, own_variance = fits[rows, cols], variance[rows, cols]
     mass = np.zeros(variance.shape)
     mass[rows, cols] = 1.0
-    near = 0.010 / cell_m
+    near = AGREE_M / cell_m
     mass = gaussian_filter(mass, near, mode="constant", truncate=2.5)[rows, cols]
     weight = 1.0 / np.maximum(own_variance, 1e-18) ** 2
     total, value, noise = weight.copy(), weight[:, None] * own, weight * own_variance

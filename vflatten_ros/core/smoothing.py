@@ -15,6 +15,8 @@ from vflatten_ros.core.geometry import Float
 from vflatten_ros.core.raygrid import RayGrid
 from vflatten_ros.core.values import Bool, Int
 
+OBLIQUE = 0.6  # cosine of the angle to the rays below which fits become wider
+WIDEST = 2.5
 # second differences by row, by column and mixed (twice in the bending energy)
 BENDING = (
     (((-1, 0), (0, 0), (1, 0)), (1.0, -2.0, 1.0)),
@@ -82,26 +84,57 @@ def quadratic_image(depth: Float, seen: Bool, where: Bool, width: float) -> tupl
     return fits, gain
 
 
-def noise_inflation(residual: Float, seen: Bool, reach: int = 3) -> float:
-    """Sum of the noise's autocorrelation: by how much correlated noise raises a mean's variance.
+def noise_inflation(residual: Float, seen: Bool, width: float) -> float:
+    """By how much the noise's correlation raises the variance of a local fit.
 
-    At least 1, that of independent noise.
+    The noise is taken as a white part and a part with a Gaussian correlation; both and the width
+    come from the residuals' correlation at small distances, less a constant that the fit took.
+
+    Parameters
+    ----------
+    residual : ndarray of shape (rows, cols)
+        Measured less fitted depth.
+    seen : ndarray of shape (rows, cols)
+    width : float
+        Standard deviation of the fit's weight, grid steps.
     """
     limit = 4 * float(np.median(np.abs(residual[seen])))
     good = seen & (np.abs(residual) < limit)
     noise = np.where(good, residual, 0.0)
-    own = float((noise**2).sum() / max(int(good.sum()), 1))
-    total = 1.0
-    for r in range(reach + 1):
-        for c in range(-reach, reach + 1):
-            if (r, c) <= (0, 0) or r * r + c * c > reach * reach:
-                continue
-            a = (slice(0, noise.shape[0] - r), slice(max(0, -c), noise.shape[1] - max(0, c)))
-            b = (slice(r, noise.shape[0]), slice(max(0, c), noise.shape[1] - max(0, -c)))
-            both = float((good[a] & good[b]).sum())
-            if both > 0 and own > 0:
-                total += 2 * max(float((noise[a] * noise[b]).sum()) / both / own, 0.0)
-    return total
+    own = float((noise**2).sum()) / max(int(good.sum()), 1)
+    if own <= 0:
+        return 1.0
+    lags = np.array([(r, c) for r in range(5) for c in range(5) if 0 < r * r + c * c <= 16])
+    found = np.array([_product(noise, good, r, c) for r, c in lags]) / own
+    squared = (lags**2).sum(axis=1)
+    best, inflation = np.inf, 1.0
+    for scale in np.arange(0.6, 3.1, 0.2):
+        shape = np.stack([np.exp(-squared / (4 * scale**2)), np.ones(len(lags))], axis=1)
+        (share, offset), *_ = np.linalg.lstsq(shape, found, rcond=None)
+        misfit = float(((shape @ (share, offset) - found) ** 2).sum())
+        if misfit < best:
+            share = (
+                float(np.clip((share + offset) / (1 + offset), 0.0, 1.0))
+                if offset < 0
+                else float(np.clip(share, 0, 1))
+            )
+            spread = 4 * np.pi * scale**2 * width**2 / (width**2 + scale**2)
+            best, inflation = misfit, 1 + share * max(spread - 1, 0.0)
+    return inflation
+
+
+def _product(noise: Float, good: Bool, r: int, c: int) -> float:
+    """Mean product of values r rows and c columns apart, in both diagonals."""
+    rows, cols = noise.shape
+    total, count = 0.0, 0
+    for c_from, c_to in (
+        (slice(0, cols - c), slice(c, cols)),
+        (slice(c, cols), slice(0, cols - c)),
+    ):
+        a, b = (slice(0, rows - r), c_from), (slice(r, rows), c_to)
+        total += float((noise[a] * noise[b]).sum())
+        count += int((good[a] & good[b]).sum())
+    return total / max(count, 1)
 
 
 def fill_holes(fits: Float, known: Bool, holes: Bool) -> Float:
@@ -206,10 +239,11 @@ def tangent_fits(
     fits (k, 6), gain (k,), good (k,)
     """
     axes = _principal_axes(points, window, near, middle, 1.5 * width_m)
+    width = width_m * _widening(rays, rc, axes[2])
     normal = np.zeros((6, 6, len(rc)))
     right = np.zeros((6, len(rc)))
     for at, counts in zip(window, near):
-        away = (points[:, at] - middle) / width_m
+        away = (points[:, at] - middle) / width
         u, v, w = (a[0] * away[0] + a[1] * away[1] + a[2] * away[2] for a in axes)
         weight = np.exp(-0.5 * (u * u + v * v)) * counts
         basis = (weight, weight * u, weight * v, weight * u * u, weight * u * v, weight * v * v)
@@ -223,7 +257,14 @@ def tangent_fits(
             normal[j, i] = normal[i, j]
     normal[0, 0] += 1e-9
     surface, gain = _solve(np.moveaxis(normal, 2, 0), right.T)
-    return _to_rays(rays, rc, middle.T, np.moveaxis(axes, 2, 0), surface, width_m, gain)
+    return _to_rays(rays, rc, middle.T, np.moveaxis(axes, 2, 0), surface, width, gain)
+
+
+def _widening(rays: RayGrid, rc: Float, normal: Float) -> Float:
+    """(k,) how much wider fits are where the rays hit the surface, and so sample it, obliquely."""
+    ray = rays.rays(rc)
+    cosine = np.abs(np.einsum("ik,ki->k", normal, ray)) / np.linalg.norm(ray, axis=1)
+    return np.clip(OBLIQUE / np.maximum(cosine, 1e-9), 1.0, WIDEST)
 
 
 def plane_fits(rays: RayGrid, rc: Float, foot: Float, normal: Float) -> Float:
@@ -241,9 +282,7 @@ def plane_fits(rays: RayGrid, rc: Float, foot: Float, normal: Float) -> Float:
     return fits
 
 
-def _principal_axes(
-    points: Float, window: Int, near: Bool, middle: Float, width_m: float
-) -> Float:
+def _principal_axes(points: Float, window: Int, near: Bool, middle: Float, width_m: float) -> Float:
     """(3, 3, k) axes by component: two tangents and the normal."""
     count = middle.shape[1]
     total, mean = np.full(count, 1e-12), np.zeros((3, count))
@@ -271,7 +310,7 @@ def _to_rays(
     centre: Float,
     axes: Float,
     surface: Float,
-    width_m: float,
+    width_m: Float,
     gain: Float,
 ) -> tuple[Float, Float, Bool]:
     """Fits as depth along the rays, by implicit differentiation of w - f(u, v) = 0."""
@@ -306,15 +345,15 @@ def _implicit(
     centre: Float,
     axes: Float,
     surface: Float,
-    width_m: float,
+    width_m: Float,
 ) -> tuple[Float, Float, Float]:
     """Gradient (k, 3) and Hessian (k, 3, 3) of w - f(u, v) by (row, col, depth), its value."""
     ray = rays.rays(rc)
-    p = np.einsum("kij,kj->ki", axes, rays.to_points(rc, depth) - centre) / width_m
+    p = np.einsum("kij,kj->ki", axes, rays.to_points(rc, depth) - centre) / width_m[:, None]
     d_row = rays.e_row + depth[:, None] * rays.ray_row
     d_col = rays.e_col + depth[:, None] * rays.ray_col
     motion = np.stack([d_row, d_col, ray], axis=2)  # (k, 3, 3) columns: point by row, col, depth
-    local = np.matmul(axes, motion) / width_m
+    local = np.matmul(axes, motion) / width_m[:, None, None]
     u, v = p[:, 0], p[:, 1]
     f_u = surface[:, 1] + 2 * surface[:, 3] * u + surface[:, 4] * v
     f_v = surface[:, 2] + surface[:, 4] * u + 2 * surface[:, 5] * v

@@ -103,7 +103,7 @@ def fit_surface(
         fits = _linear_fits(points, toward, rays, layers, measured, fits, cell, config.radius_m)
     else:
         _refit(rays, layers, measured, special, width * cell, fits, gain)
-        variance = noise**2 * gain * noise_inflation(image - fits[..., 0], seen)
+        variance = noise**2 * gain * noise_inflation(image - fits[..., 0], seen, width)
         if config.along_rulings:
             fits, variance = average_along_rulings(fits, variance, layers, cell, width * cell)
         gain = variance / max(noise, 1e-12) ** 2
@@ -134,8 +134,8 @@ def _assemble(
 def _special(layers: Layers, fits: Float, cell: float, reach: int) -> Bool:
     """Places near a jump or steeper than 50 degrees."""
     cut = np.zeros(layers.valid.shape, bool)
-    cut[:, :-1] |= layers.valid[:, :-1] & layers.valid[:, 1:] & ~layers.right[:, :-1]
-    cut[:-1] |= layers.valid[:-1] & layers.valid[1:] & ~layers.down[:-1]
+    cut[:, :-1] |= layers.valid[:, :-1] & layers.valid[:, 1:] & ~layers.smooth_right[:, :-1]
+    cut[:-1] |= layers.valid[:-1] & layers.valid[1:] & ~layers.smooth_down[:-1]
     steep = np.hypot(fits[..., 1], fits[..., 2]) > 1.2 * cell
     return np.asarray(layers.valid & ~layers.bridged & (maximum_filter(cut, 2 * reach + 1) | steep))
 

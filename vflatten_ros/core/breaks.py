@@ -33,6 +33,13 @@ class Layers:
     label: NDArray[np.int32]  # (rows, cols) number of the piece, -1: none
 
 
+def near_measured(seen: Bool) -> Bool:
+    """Measured places, those within RING of them, and small holes."""
+    holes, _ = connected_regions(~seen)
+    small = np.bincount(holes.ravel())[holes] <= HOLE
+    return np.asarray((distance_transform_edt(~seen) <= RING) | small)
+
+
 def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m: float) -> Layers:
     """Join grid neighbours that no depth jump separates.
 

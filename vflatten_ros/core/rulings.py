@@ -22,7 +22,7 @@ STEP_M = 0.006
 REACH = 12  # samples to each side
 DIRECTION_M = 0.015  # the direction is averaged over so much, standard deviation
 AGREE_M = 0.02  # windows are judged over so much, standard deviation
-CHUNK = 20000
+CHUNK = 4000
 
 
 def average_along_rulings(
@@ -46,7 +46,8 @@ def average_along_rulings(
     -------
     fits, variance : as given
     """
-    rows, cols = np.nonzero(layers.valid & ~layers.bridged)
+    usable = layers.valid & ~layers.bridged
+    rows, cols = np.nonzero(usable)
     direction = ruling_directions(fits, layers, cell_m)[rows, cols]
     estimates = np.empty((len(WINDOWS_M), len(rows), 6))
     spread = np.empty((len(WINDOWS_M), len(rows)))
@@ -54,7 +55,7 @@ def average_along_rulings(
     for k in range(0, len(rows), CHUNK):
         part = slice(k, k + CHUNK)
         estimates[:, part], spread[:, part] = _windows(
-            fits, variance, layers, rows[part], cols[part], direction[part], cell_m, inflation
+            fits, variance, usable, rows[part], cols[part], direction[part], cell_m, inflation
         )
     return _blend(fits, variance, rows, cols, estimates, spread, cell_m)
 
@@ -80,76 +81,70 @@ def _correlated(width_m: float) -> float:
 
 
 def _windows(
-    fits: Float, variance: Float, layers: Layers, rows: Int, cols: Int, direction: Float,
+    fits: Float, variance: Float, usable: Bool, rows: Int, cols: Int, direction: Float,
     cell_m: float, inflation: float,
 ) -> tuple[Float, Float]:  # fmt: skip
     """(windows, k, 6) estimates of the fits and (windows, k) variances of their depth."""
-    count = len(rows)
     own = fits[rows, cols]
-    along = np.einsum("ki,ki->k", own[:, 1:3], direction)
-    stride = STEP_M / np.hypot(cell_m, along)  # grid steps a sample
-    sums = np.zeros((len(WINDOWS_M), 5, count))  # of w, w t, w t^2, w^2, w^2 t ... see below
-    values = np.zeros((len(WINDOWS_M), 2, count, 6))
     own_variance = np.maximum(variance[rows, cols], 1e-18)
+    rise = own[:, 1] * direction[:, 0] + own[:, 2] * direction[:, 1]
+    stride = STEP_M / np.hypot(cell_m, rise)  # grid steps a sample
+    samples = np.empty((2 * REACH + 1, len(rows), 6))
+    weights = np.empty((2 * REACH + 1, len(rows)))
+    flat = fits.reshape(-1, 6), variance.ravel(), usable.ravel()
     for side in (1, -1):
-        free = np.ones(count, bool)
+        free = np.ones(len(rows), bool)
         before = own[:, 0]
         for k in range(0 if side > 0 else 1, REACH + 1):
-            sample, weight, free, before = _sample(
-                fits, variance, layers, rows, cols, direction, stride * side * k, free, before,
-                along * stride * side, own_variance, cell_m,
-            )  # fmt: skip
-            t = side * k * STEP_M
-            for i, window in enumerate(WINDOWS_M):
-                fall = np.exp(-0.5 * (t / window) ** 2)
-                if fall < 0.01:
-                    continue
-                w = fall * weight
-                sums[i, 0] += w
-                sums[i, 1] += w * t
-                sums[i, 2] += w * t * t
-                sums[i, 3] += w * fall
-                sums[i, 4] += w * fall * t
-                values[i, 0] += w[:, None] * sample
-                values[i, 1] += (w * t)[:, None] * sample
-    return _straight(own, own_variance, sums, values, inflation)
+            distance = stride * (side * k)
+            at, offset = _nearest(usable.shape, rows, cols, direction, distance)
+            fit = flat[0].take(at, axis=0)
+            fit[:, 0], slope = value_at(fit, offset), slope_at(fit, offset)
+            fit[:, 1:3] = slope
+            step = rise * stride * side if k else 0.0
+            # the way there is one surface as long as depth goes on as it began
+            free &= np.abs(fit[:, 0] - before - step) < 0.5 * (cell_m + np.abs(step))
+            free &= flat[2].take(at)
+            before = fit[:, 0]
+            weight = free * np.minimum(own_variance / np.maximum(flat[1].take(at), 1e-18), 4.0)
+            weights[REACH + side * k] = weight
+            np.multiply(fit, weight[:, None], out=samples[REACH + side * k])
+    return _straight(own, own_variance, samples, weights, inflation)
 
 
-def _sample(
-    fits: Float, variance: Float, layers: Layers, rows: Int, cols: Int, direction: Float,
-    distance: Float, free: Bool, before: Float, rise: Float, own_variance: Float, cell_m: float,
-) -> tuple[Float, Float, Bool, Float]:  # fmt: skip
-    """Fits some way along the rulings, their weights, and whether the way there is one surface."""
+def _nearest(
+    shape: tuple[int, ...], rows: Int, cols: Int, direction: Float, distance: Float
+) -> tuple[Int, Float]:
+    """Flat index of the grid place nearest to some way along the rulings, and the way from it."""
     r, c = rows + distance * direction[:, 0], cols + distance * direction[:, 1]
-    i = np.clip(np.round(r).astype(np.int64), 0, fits.shape[0] - 1)
-    j = np.clip(np.round(c).astype(np.int64), 0, fits.shape[1] - 1)
-    fit = fits[i, j]
-    offset = np.stack([r - i, c - j], axis=1)
-    sample = fit.copy()
-    sample[:, 0] = value_at(fit, offset)
-    sample[:, 1:3] = slope_at(fit, offset)
-    free = free & layers.valid[i, j] & ~layers.bridged[i, j]
-    if distance.any():
-        step = np.abs(sample[:, 0] - before - rise)
-        free &= step < 0.5 * (cell_m + np.abs(rise))
-    weight = free * np.minimum(own_variance / np.maximum(variance[i, j], 1e-18), 4.0)
-    return sample, weight, free, sample[:, 0]
+    i, j = np.rint(r), np.rint(c)
+    np.clip(i, 0, shape[0] - 1, out=i)
+    np.clip(j, 0, shape[1] - 1, out=j)
+    return (i * shape[1] + j).astype(np.int64), np.stack([r - i, c - j], axis=1)
 
 
 def _straight(
-    own: Float, own_variance: Float, sums: Float, values: Float, inflation: float
+    own: Float, own_variance: Float, samples: Float, weights: Float, inflation: float
 ) -> tuple[Float, Float]:
-    """Value at the place itself of the line through the samples, by least squares."""
-    s0, s1, s2, q0, _ = sums.swapaxes(0, 1)
+    """Value at the place itself of the line through the samples, by least squares.
+
+    `samples` are weighted already.
+    """
+    t = np.arange(-REACH, REACH + 1) * STEP_M
+    fall = np.exp(-0.5 * (t / np.array(WINDOWS_M)[:, None]) ** 2)  # (windows, samples)
+    count, size = len(own), len(t)
+    s0, s1, s2, q0 = (f @ weights for f in (fall, fall * t, fall * t * t, fall * fall))
+    flat = samples.reshape(size, -1)
+    v0, v1 = (f @ flat for f in (fall, fall * t))
     determinant = s0 * s2 - s1 * s1
     enough = determinant > 1e-3 * s0 * s2
     safe = np.where(enough, determinant, 1.0)
-    line = (s2[..., None] * values[:, 0] - s1[..., None] * values[:, 1]) / safe[..., None]
-    estimates = np.where(enough[..., None], line, own)
+    line = (s2 / safe)[..., None] * v0.reshape(-1, count, 6)
+    line -= (s1 / safe)[..., None] * v1.reshape(-1, count, 6)
     # variance of the line's value: that of the mean, times how far the place is from the middle
-    lever = s0 * s2 / safe
-    share = inflation * q0 / np.maximum(s0, 1e-30) ** 2 * lever
-    return estimates, np.where(enough, np.minimum(share, 1.0), 1.0) * own_variance
+    share = inflation * q0 / np.maximum(s0, 1e-30) ** 2 * (s0 * s2 / safe)
+    spread = np.where(enough, np.minimum(share, 1.0), 1.0) * own_variance
+    return np.where(enough[..., None], line, own), spread
 
 
 def _blend(

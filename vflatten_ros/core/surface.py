@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.arrays import as_points
-from vflatten_ros.core.breaks import Layers, connected_window, find_layers
+from vflatten_ros.core.breaks import Layers, connected_window, find_layers, near_measured
 from vflatten_ros.core.config import SurfaceConfig
 from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.raygrid import RayGrid, camera_rays, parallel_rays
@@ -91,13 +91,12 @@ def fit_surface(
     progress("surface", 0.2)
     cell = _cell(rays, float(np.median(image[seen])))
     width = max(config.radius_m / 1.75 / cell, 1.2)
-    fits, gain = quadratic_image(image, seen, seen, width)
+    fits, gain = quadratic_image(image, seen, near_measured(seen), width)
     noise = 1.4826 * float(np.median(np.abs(image - fits[..., 0])[seen]))
     places = np.stack(np.indices(seen.shape), axis=-1).astype(float)
     measured = rays.to_points(places, image)
     layers = find_layers(image, seen, measured, cell, noise)
     progress("surface", 0.5)
-    fits, gain = quadratic_image(image, seen, layers.valid, width)
     special = _special(layers, fits, cell, int(np.ceil(2 * width)))
     if config.fit == "linear":
         fits = _linear_fits(points, toward, rays, layers, measured, fits, cell, config.radius_m)

@@ -23,7 +23,6 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
-
 from vflatten_ros.action import Flatten
 from vflatten_ros.msg import Correspondence, Status, ViewBufferState
 from vflatten_ros.srv import AddCorrespondences, GetState, LocateLandmark
@@ -156,6 +155,7 @@ def main() -> int:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("recording", type=Path, help="folder with protocol.json, if any")
     options.add_argument("--node", default="vflatten", help="name of the node, with its namespace")
+    options.add_argument("--namespace", default="/", help="of the topics that are played")
     options.add_argument("--method", default="", help="default: kita2019 with a protocol.json")
     options.add_argument("--rate", type=float, default=1.0, help="of the recording")
     options.add_argument("--no-play", action="store_true", help="somebody else turns the item")
@@ -174,7 +174,8 @@ def main() -> int:
         planner.call("new_item")
         if not args.no_play:
             command = [sys.executable, "-m", "vflatten_ros.player", str(args.recording)]
-            player = subprocess.Popen([*command, "--rate", str(args.rate), "--quiet"])
+            command += ["--rate", str(args.rate), "--quiet"]
+            player = subprocess.Popen([*command, "--ros-args", "-r", f"__ns:={args.namespace}"])
         planner.gather(player, max(protocol["views"], default=0) + 1 if by_hand else None)
         if by_hand:
             planner.add_correspondences(protocol)

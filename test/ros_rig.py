@@ -12,20 +12,23 @@ import time
 from pathlib import Path
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from vflatten_ros.action import Flatten
 
 from vflatten_ros import srv
 from vflatten_ros.bag import open_recording
-from vflatten_ros.player import Player, rounds
+from vflatten_ros.player import DISCOVERY_S, Player, rounds
 
 ROOT = Path(__file__).parents[1]
 RECORDING = ROOT / "bags" / "LS1_1"
+CLOUDS, JOINTS = "/rig/points", "/gripper/joint_states"  # of the recording
 CALIBRATION = RECORDING / "calibration.yaml"
 QUICK = [str(Path(__file__).parent / "ros" / "quick_node.py")]
 REAL = ["-m", "vflatten_ros.node"]
@@ -134,14 +137,32 @@ class Rig:
         log = self._folder / f"node{self.namespace.strip('/')}.log"
         self.node = Process([*self._kind, *given[:at], *ros], log)
         self._processes.append(self.node)
+        self._connected = False
         if wait:
             self.until(lambda: self.lifecycle_state() == 3, "active")
         return self.node
 
     def turn(self, rate=6, keep=lambda message: True):
         """Publish the recording from this process: no start-up, no discovery."""
-        self.until(self.turntable.has_subscribers, "the node's subscriptions")
+        self.connect()
         self.turntable.play(filter(keep, recorded()), rate)
+
+    def connect(self):
+        """Wait until the node hears what this process publishes."""
+        if not self._connected:
+            self.until(self.turntable.has_subscribers, "the node's subscriptions")
+            time.sleep(DISCOVERY_S)
+            self._connected = True
+
+    def reconnect(self):
+        """The node has new subscriptions."""
+        self._connected = False
+        self.connect()
+
+    def publish(self, message):
+        """Publish a cloud or a joint state."""
+        self.connect()
+        self.turntable.publish(CLOUDS if isinstance(message, PointCloud2) else JOINTS, message)
 
     def play(self, *options, recording=RECORDING, wait=True):
         """Play a recording to this node."""
@@ -182,7 +203,7 @@ class Rig:
         client = self._clients[service]
         self.until(client.service_is_ready, f"service {service}")
         request = client.srv_type.Request(**fields)
-        again = service in ("state", "get_parameters")
+        again = service in ("state", "get_parameters", "new_item")
         future = client.call_async(request)
         if again:
             rclpy.spin_until_future_complete(self.planner, future, timeout_sec=5.0)
@@ -203,6 +224,23 @@ class Rig:
     def set_parameter(self, name, value):
         message = Parameter(name, value=value).to_parameter_msg()
         return self.ask("set_parameters", parameters=[message]).results[0]
+
+    def diagnostics(self):
+        """Values of the next diagnostics of this node, by part."""
+        name = f"{self.namespace}/vflatten"
+        found = {}
+
+        def keep(message):
+            for status in message.status:
+                if status.hardware_id == name:
+                    values = {value.key: value.value for value in status.values}
+                    found[status.name.split(": ")[1]] = values | {"": status.message}
+
+        node = self.planner
+        subscription = node.create_subscription(DiagnosticArray, "/diagnostics", keep, 10)
+        self.until(lambda: "flattening" in found, "diagnostics")
+        node.destroy_subscription(subscription)
+        return found
 
     def send_goal(self, on_feedback=None, **goal):
         self.until(self._action.server_is_ready, "the action")
@@ -232,6 +270,11 @@ class Rig:
         answer = self.flatten()
         assert answer.result.status.code == 0, answer.result.status.message
         assert list(answer.result.flattened.view_ids) == list(range(24))
+
+    def settled(self, clouds):
+        """The buffer once so many clouds have come and none waits, else None."""
+        buffer = self.buffer()
+        return buffer if buffer.clouds_received >= clouds and not buffer.clouds_waiting else None
 
     def complete(self):
         """The buffer once the rotation is complete, else None."""

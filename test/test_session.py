@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from vflatten_ros import messages, session
-from vflatten_ros.core.buffer import ItemStarted
 from vflatten_ros.core.config import Config
+from vflatten_ros.core.events import ItemStarted
 from vflatten_ros.session import Refused, Session
 
 PAIRS = garments.example_garment().correspondences

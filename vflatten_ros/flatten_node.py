@@ -15,15 +15,15 @@ from rclpy.duration import Duration
 
 from vflatten_ros.bag import cloud_from, stamp_ns
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core.buffer import (
+from vflatten_ros.core.calibration import calibration_from
+from vflatten_ros.core.errors import InvalidCloud, InvalidConfig
+from vflatten_ros.core.events import (
     ClockJumped,
     CloudDropped,
     Event,
     ItemStarted,
     RotationComplete,
 )
-from vflatten_ros.core.calibration import calibration_from
-from vflatten_ros.core.errors import InvalidCloud, InvalidConfig
 from vflatten_ros.core.values import Calibration, FlatGarment
 from vflatten_ros.files import load_calibration
 from vflatten_ros.frames import Frames
@@ -79,7 +79,9 @@ class FlattenNode(AnsweringLifecycleNode):
         self._failing = False
         self._last = ""
         self._throttle = Throttle()
-        self._declared = Parameters(self, lambda: self.lifecycle_state()[0] == ACTIVE)
+        self._declared = Parameters(
+            self, lambda: self.lifecycle_state()[0] == ACTIVE, self._on_settings
+        )
         self._results = Outputs(self)
         self._sensors = Inputs(self, self._on_cloud, self._on_joints)
         self._requests = Services(self)
@@ -109,6 +111,10 @@ class FlattenNode(AnsweringLifecycleNode):
 
     def _why(self) -> str:
         return f" (last try: {self.trouble})" if self.trouble else ""
+
+    def _on_settings(self, settings: Settings) -> None:
+        if self.session is not None:
+            self.session.buffer.configure(settings.core)
 
     # ---- lifecycle
 
@@ -166,6 +172,7 @@ class FlattenNode(AnsweringLifecycleNode):
     def _on_cloud(self, message: Any) -> None:
         if self.session is None:
             return
+        self._sensors.take_joint_states()
         now = time.monotonic_ns()
         try:
             events = self.session.add_cloud(cloud_from(message), now)
@@ -274,6 +281,7 @@ class FlattenNode(AnsweringLifecycleNode):
 
     def _on_tick(self) -> None:
         if self.session is not None and self.lifecycle_state()[0] == ACTIVE:
+            self._sensors.take_joint_states()
             self.take_events(self.session.tick(time.monotonic_ns()))
         if self.goals is not None:
             for line in self.goals.check_deadlines():

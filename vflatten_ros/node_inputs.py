@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState, PointCloud2
 from vflatten_ros.node_outputs import OK, WARN, Status
 from vflatten_ros.parameters import CloudInput, JointInput
 
+MAX_PUBLISHERS = 4
 REPEAT_S = 60.0  # between warnings that say the same
 
 
@@ -37,13 +38,28 @@ class Throttle:
         return f"{text} ({held} more like this since the last line)" if held else text
 
 
+class Numbers:
+    """Gaps in the numbers that publishers give their messages; whose they are, rclpy hides."""
+
+    def __init__(self) -> None:
+        self._last: list[int] = []  # of each publisher heard, the most recent first
+
+    def missing_before(self, number: int) -> int:
+        """How many messages are missing before this one; none before a publisher's first."""
+        before = max((last for last in self._last if last < number), default=None)
+        if before is not None:
+            self._last.remove(before)
+        self._last = [number, *self._last[: MAX_PUBLISHERS - 1]]
+        return 0 if before is None else number - before - 1
+
+
 @dataclass
 class Traffic:
     """What has happened on one topic."""
 
     received: int = 0
     lost: int = 0  # gaps in the publisher's numbers
-    number: int = 0  # of the last message, by its publisher
+    numbers: Numbers = field(default_factory=lambda: Numbers())
     last_s: float = 0.0  # monotonic
     incompatible: str = ""  # QoS policy that keeps a publisher from us
     quiet: bool = False
@@ -85,6 +101,22 @@ class Inputs:
         for subscription in self._subscriptions.values():
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
+
+    def take_joint_states(self) -> None:
+        """Take every joint state that has come, now.
+
+        rclpy's executor takes one message of each topic in turn: behind a few clouds, hundreds of
+        joint states would wait until the clouds have no patience left, or push one another out.
+        """
+        subscription = self._subscriptions.get("joint_states")
+        if subscription is None:
+            return
+        callback = self._counted("joint_states")
+        with subscription.handle:
+            taken = subscription.handle.take_message(JointState, False)
+            while taken is not None:
+                callback(*taken)
+                taken = subscription.handle.take_message(JointState, False)
 
     def check_quiet(self, limit_s: float) -> list[str]:
         """Warnings for topics on which nothing has come for long; once for each time."""
@@ -163,18 +195,13 @@ class Inputs:
         return note
 
     def _count_lost(self, name: str, number: int) -> None:
-        """Count what is missing before this message; a restarted publisher begins anew."""
-        traffic = self.traffic[name]
-        missing = number - traffic.number - 1 if traffic.number else 0
-        traffic.number = number
-        if missing <= 0 or name not in self._subscriptions:
-            return
-        topic = self._subscriptions[name].topic_name
-        if self._node.count_publishers(topic) == 1:  # the numbers of several interleave
-            traffic.lost += missing
+        missing = self.traffic[name].numbers.missing_before(number)
+        if missing and name in self._subscriptions:
+            self.traffic[name].lost += missing
+            topic = self._subscriptions[name].topic_name
             self._node.get_logger().warning(
-                f"{traffic.lost} messages of {topic} lost on the way since the start; raise "
-                f"{name}.depth or see docs/node.md, DDS",
+                f"{self.traffic[name].lost} messages of {topic} lost "
+                f"on the way since the start; raise {name}.depth or see docs/node.md, DDS",
                 throttle_duration_sec=REPEAT_S,
             )
 

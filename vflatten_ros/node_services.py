@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from vflatten_ros import messages
 from vflatten_ros.action import Flatten
-from vflatten_ros.core.buffer import Event
+from vflatten_ros.core.events import Event
 from vflatten_ros.core.geometry import transform_points
 from vflatten_ros.core.values import FlatGarment, Landmark
 from vflatten_ros.goals import Listener
@@ -152,9 +152,10 @@ class Services:
     # ---- corresponding points
 
     def _add_pairs(self, request: Any, response: Any) -> None:
+        session = self._session()
         if not request.pairs:
             raise Refused(INVALID_ARGUMENT, "the request holds no pairs")
-        answers = self._session().add_pairs(messages.read(pair) for pair in request.pairs)
+        answers = session.add_pairs(messages.read(pair) for pair in request.pairs)
         response.ids = [number for number, _ in answers]
         response.accepted = [number > 0 for number, _ in answers]
         response.reasons = [reason for _, reason in answers]

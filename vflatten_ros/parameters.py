@@ -224,7 +224,12 @@ class Settings:
 class Parameters:
     """The parameters of a running node: declared, checked on every change, read as Settings."""
 
-    def __init__(self, node: Node, is_active: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        is_active: Callable[[], bool],
+        on_change: Callable[[Settings], None],
+    ) -> None:
         """Declare all parameters with their values from files and command line.
 
         Raises
@@ -232,7 +237,7 @@ class Parameters:
         InvalidConfig
             A given value has the wrong type or is out of range.
         """
-        self._is_active = is_active
+        self._is_active, self._on_change = is_active, on_change
         self._entries = {entry.name: entry for entry in entries()}
         self.settings = Settings()
         self._warn_unknown(node)
@@ -265,6 +270,7 @@ class Parameters:
             self.settings = self._checked(changes)
         except InvalidConfig as error:
             return SetParametersResult(successful=False, reason=str(error))
+        self._on_change(self.settings)
         return SetParametersResult(successful=True)
 
     def _checked(self, changes: list[Any]) -> Settings:

@@ -23,6 +23,7 @@ from vflatten_ros.core.errors import VFlattenError
 from vflatten_ros.messages import fill, time_fields
 
 CLOCK_PERIOD_NS = 10_000_000
+DISCOVERY_S = 0.5  # a publisher sees its subscriber before the subscriber sees the publisher
 CACHED_BYTES = 512e6  # a looped recording up to this size is read once
 
 
@@ -98,9 +99,14 @@ class Player:
         end = time.monotonic() + limit_s
         while rclpy.ok() and time.monotonic() < end:
             if self.has_subscribers():
+                time.sleep(DISCOVERY_S)
                 return True
             time.sleep(0.02)
         return False
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish one message, or its serialized bytes, on a topic of the recording."""
+        self._publishers[topic].publish(message)
 
     def play(self, messages: Iterable[Any], rate: float) -> None:
         """Publish messages at their log times, from now on."""
@@ -111,7 +117,7 @@ class Player:
             if not rclpy.ok():
                 return
             # the recorded bytes, not decoded and encoded again
-            self._publishers[message.topic].publish(message.cdr)
+            self.publish(message.topic, message.cdr)
             self.published[message.topic] += 1
 
     def _sleep_until(self, start_s: float, first_ns: int, log_ns: int, rate: float) -> None:

@@ -7,9 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from vflatten_ros import messages
-from vflatten_ros.core.buffer import CloudDropped, Event, ItemStarted, ViewBuffer
+from vflatten_ros.core.buffer import ViewBuffer
 from vflatten_ros.core.config import METHODS, Config
 from vflatten_ros.core.errors import InvalidCorrespondence, VFlattenError
+from vflatten_ros.core.events import CloudDropped, Event, ItemStarted
 from vflatten_ros.core.values import Calibration, Cloud, Correspondence, View
 from vflatten_ros.goals import Task
 

@@ -3,7 +3,6 @@
 import numpy as np
 import rclpy
 import slow_work
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PolygonStamped
 from ros_rig import LATCHED
 from sensor_msgs.msg import Image, PointCloud2
@@ -22,32 +21,15 @@ OUTPUTS = {
 }
 
 
-def diagnostics(rig):
-    """The next diagnostics of the rig's node, by part."""
-    name = f"{rig.namespace}/vflatten"
-    found = {}
-
-    def keep(message):
-        for status in message.status:
-            if status.hardware_id == name:
-                part = status.name.split(": ")[1]
-                found[part] = (status.message, {v.key: v.value for v in status.values})
-
-    subscription = rig.planner.create_subscription(DiagnosticArray, "/diagnostics", keep, 10)
-    rig.until(lambda: "flattening" in found, "diagnostics")
-    rig.planner.destroy_subscription(subscription)
-    return found
-
-
 def test_all_clouds_at_four_times_the_rate_are_buffered_and_flattened_without_asking(rig):
     rig.set_parameter("auto_flatten", True)
-    before = diagnostics(rig)["clouds"][1]
+    before = rig.diagnostics()["clouds"]
     rig.play("--rate", 4, "--best-effort")
     buffer = rig.until(rig.complete, "the rotation")
     assert [view.id for view in buffer.views] == list(range(24))
     assert not buffer.drop_counts
     rig.until(lambda: "flattened in" in rig.node.log(), "flattening by itself")
-    after = diagnostics(rig)["clouds"][1]
+    after = rig.diagnostics()["clouds"]
     assert int(after["received"]) - int(before["received"]) == 24
     assert int(after["lost in transport"]) == int(before["lost in transport"])
 

@@ -81,6 +81,13 @@ class ViewBuffer:
         self._suspect: tuple[int, float] | None = None
         self._begin_item()
 
+    def configure(self, config: Config) -> None:
+        """Use other settings from now on; views and joint states so far stay."""
+        if config.buffer != self._config.buffer:
+            self._fingers = FingerWatch(config.buffer)
+        self._track.configure(config.joints)
+        self._config = config
+
     # ---- what comes in
 
     def add_joint(

@@ -58,6 +58,10 @@ class JointTrack:
         self._lowest = math.inf
         self._highest = -math.inf
 
+    def configure(self, config: JointConfig) -> None:
+        """Use other settings from now on; the samples stay."""
+        self._config = config
+
     def __len__(self) -> int:
         return len(self._stamps)
 

@@ -1,0 +1,182 @@
+"""Lifecycle and parameters: every request is answered, and a refusal says why."""
+
+import pytest
+import rclpy
+from lifecycle_msgs.msg import Transition
+from rcl_interfaces.msg import ParameterType
+from ros_rig import CALIBRATION, REAL, Process, Rig
+from sensor_msgs.msg import JointState
+from vflatten_ros.msg import Status
+
+UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = 1, 2, 3, 4
+CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
+# state -> valid transitions and where they lead; every other one is to be refused
+VALID = {
+    UNCONFIGURED: {CONFIGURE: INACTIVE, 5: FINALIZED},
+    INACTIVE: {CLEANUP: UNCONFIGURED, ACTIVATE: ACTIVE, 6: FINALIZED},
+    ACTIVE: {DEACTIVATE: INACTIVE, 7: FINALIZED},
+    FINALIZED: {},
+}
+ALL = [*range(9), 10, 20, 30, 40, 50, 60, 99, 255]
+
+
+@pytest.fixture(scope="module")
+def rig(ros, tmp_path_factory):
+    """A node that starts nothing by itself."""
+    arguments = ["--ros-args", "-p", "autostart:=false"]
+    rig = Rig(tmp_path_factory.mktemp("lifecycle"), arguments=arguments, wait=False)
+    yield rig
+    rig.close()
+
+
+def change(rig, transition, label=""):
+    answer = rig.ask("change_state", transition=Transition(id=transition, label=label))
+    return answer.success
+
+
+def bring(rig, state):
+    """To a state, from whatever state an earlier test left."""
+    way_down = {INACTIVE: CLEANUP, ACTIVE: DEACTIVATE}
+    while (now := rig.lifecycle_state()) != UNCONFIGURED:
+        assert change(rig, way_down[now])
+    for transition in (CONFIGURE, ACTIVATE)[: state - 1]:
+        assert change(rig, transition)
+
+
+def test_every_transition_in_every_state_gets_an_answer(rig):
+    rig.until(lambda: rig.lifecycle_state() == UNCONFIGURED, "the node")
+    assert rig.set_parameter("calibration.file", str(CALIBRATION)).successful
+    for state, way in ((UNCONFIGURED, None), (INACTIVE, CONFIGURE), (ACTIVE, ACTIVATE)):
+        if way is not None:
+            assert change(rig, way)
+        for transition in ALL:
+            if transition not in VALID[state]:
+                assert not change(rig, transition), (state, transition)
+                assert rig.lifecycle_state() == state
+        assert not change(rig, 0, "no such transition")
+    assert change(rig, 0, "deactivate")
+    assert change(rig, 0, "cleanup")
+    assert rig.lifecycle_state() == UNCONFIGURED
+
+
+def test_services_answer_in_every_state_and_say_what_is_missing(rig):
+    bring(rig, UNCONFIGURED)
+    for name in ("list_views", "add_correspondences", "clear_views", "select_views"):
+        answer = rig.ask(name)
+        assert answer.status.code == Status.NOT_ACTIVE
+        assert "unconfigured; activate it first" in answer.status.message
+    for name in ("flatten", "new_item", "clear"):
+        answer = rig.ask(name)
+        assert not answer.success and "activate it first" in answer.message
+    assert rig.flatten().result.status.code == Status.NOT_ACTIVE
+    assert rig.ask("state").status.code == Status.OK
+
+
+@pytest.mark.parametrize(
+    "text, reason",
+    [
+        (None, "no such file"),
+        ("frame: rig\n", "axis_point is missing"),
+        ("[1, 2", "cannot be read as YAML"),
+        (CALIBRATION.read_text().replace("joint_sign: -1", "joint_sign: 5"), "expected 1 or -1"),
+    ],
+)
+def test_a_wrong_calibration_refuses_activation_with_a_message(rig, tmp_path, text, reason):
+    file = tmp_path / "calibration.yaml"
+    if text is not None:
+        file.write_text(text)
+    rig.set_parameter("calibration.file", str(file))
+    assert change(rig, CONFIGURE)
+    assert not change(rig, ACTIVATE)
+    assert rig.lifecycle_state() == INACTIVE
+    assert reason in rig.node.log()
+    assert reason in rig.ask("new_item").message
+    rig.set_parameter("calibration.file", str(CALIBRATION))
+    assert change(rig, ACTIVATE)
+    assert change(rig, DEACTIVATE)
+    assert change(rig, CLEANUP)
+
+
+def test_a_calibration_may_be_given_by_numbers(rig):
+    rig.set_parameter("calibration.file", "")
+    bring(rig, INACTIVE)
+    assert not change(rig, ACTIVATE)
+    assert "no calibration" in rig.ask("new_item").message
+    for name, value in (
+        ("frame", "rig_optical"),
+        ("axis_point", [0.0, -0.5, 1.3]),
+        ("axis_direction", [0.0, -1.0, 0.0]),
+        ("gripper_tip", [0.0, -0.5, 1.3]),
+        ("joint", "wrist_roll"),
+    ):
+        assert rig.set_parameter(f"calibration.{name}", value).successful
+    assert change(rig, ACTIVATE)
+    assert change(rig, DEACTIVATE)
+    rig.set_parameter("calibration.tf_frame", "tool0")
+    assert change(rig, ACTIVATE) is False
+    message = rig.ask("new_item").message
+    assert "tf2_ros is not installed" in message or "no transform" in message
+    rig.set_parameter("calibration.tf_frame", "")
+    assert change(rig, CLEANUP)
+
+
+def test_parameters_are_described_and_changes_refused_with_a_reason(rig):
+    rig.set_parameter("calibration.file", str(CALIBRATION))
+    bring(rig, ACTIVE)
+    (about,) = rig.ask("describe_parameters", names=["geodesics.nodes"]).descriptors
+    assert about.type == ParameterType.PARAMETER_INTEGER
+    assert "Nodes" in about.description and about.integer_range[0].from_value == 3
+    for name, value, reason in (
+        ("geodesics.nodes", 2, "range"),
+        ("geodesics.nodes", "many", "type"),
+        ("method", "magic", "one of rotation, kita2019"),
+        ("clouds.topic", "elsewhere", "deactivate it first"),
+        ("buffer.max_views", -5, "range"),
+        ("segmentation.radius_m", float("nan"), ""),
+    ):
+        answer = rig.set_parameter(name, value)
+        assert not answer.successful, name
+        assert reason in answer.reason.lower(), answer.reason
+    assert rig.set_parameter("geodesics.nodes", 40).successful
+    (value,) = rig.ask("get_parameters", names=["geodesics.nodes"]).values
+    assert value.integer_value == 40
+
+
+def test_a_publisher_that_cannot_reach_the_node_is_named_with_the_remedy(rig):
+    bring(rig, UNCONFIGURED)
+    rig.set_parameter("calibration.file", str(CALIBRATION))
+    assert rig.set_parameter("joint_states.reliability", "reliable").successful
+    assert rig.set_parameter("no_data_warning_s", 0.5).successful
+    bring(rig, ACTIVE)
+    rig.until(lambda: f"no cloud on {rig.namespace}/rig/points" in rig.node.log(), "a warning")
+    publisher = rig.planner.create_publisher(
+        JointState, "gripper/joint_states", rclpy.qos.qos_profile_sensor_data
+    )
+    rig.until(lambda: "set joint_states.reliability to best_effort" in rig.node.log(), "the cause")
+    rig.planner.destroy_publisher(publisher)
+
+
+def test_a_finalized_node_still_answers(rig):
+    bring(rig, INACTIVE)
+    assert change(rig, 6)
+    for transition in ALL:
+        assert not change(rig, transition)
+    assert rig.lifecycle_state() == FINALIZED
+    assert rig.ask("new_item").message.startswith("the node is finalized")
+    assert rig.node.stop() == 0
+
+
+@pytest.mark.parametrize(
+    "arguments, reason",
+    [
+        (["--ros-args", "-p", "geodesics.nodes:=1"], "geodesics.nodes"),
+        (["--ros-args", "-p", "method:=5"], "method"),
+        (["--nonsense"], "unknown option '--nonsense'"),
+    ],
+)
+def test_a_wrong_start_ends_with_one_line(tmp_path, arguments, reason):
+    process = Process([*REAL, *arguments], tmp_path / "log")
+    assert process.wait() == 1
+    (line,) = [line for line in process.log().splitlines() if "vflatten node:" in line]
+    assert reason in line
+    assert "Traceback" not in process.log()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from vflatten_ros.core.boundary import boundary_points, level_pairs
 from vflatten_ros.core.config import Config
@@ -12,6 +14,7 @@ from vflatten_ros.core.geodesics import geodesic_lines
 from vflatten_ros.core.observation import Observation, observe, quads
 from vflatten_ros.core.patch_flattening import flatten_patch
 from vflatten_ros.core.sampling import thinned
+from vflatten_ros.core.surface import Surface
 from vflatten_ros.core.values import (
     Bool,
     FlatPoints,
@@ -81,7 +84,7 @@ def _laid_flat(observation: Observation) -> tuple[Float, Float, Bool]:
     """Flat place and stress (m) of every point, and which points are of the largest piece."""
     surface, (row, col) = observation.surface, observation.place.T
     patch = flatten_patch(surface)
-    piece = np.where(observation.patch >= 0, patch.piece[row, col], -1)
+    piece = np.where(observation.patch >= 0, _pieces(surface)[row, col], -1)
     size = np.bincount(piece[piece >= 0]) if (piece >= 0).any() else np.zeros(1, dtype=np.int64)
     if size.max() < FEWEST_POINTS:
         raise DisconnectedSurface(
@@ -91,6 +94,20 @@ def _laid_flat(observation: Observation) -> tuple[Float, Float, Bool]:
     uv = patch.uv[row, col].astype(np.float64)
     main = (piece == size.argmax()) & np.isfinite(uv).all(axis=1)
     return uv, patch.strain[row, col] * surface.spacing_m, main
+
+
+def _pieces(surface: Surface) -> Int:
+    """(rows, cols) number of the piece that measured neighbours make up; -1: not measured."""
+    layers = surface.layers
+    number = np.full(layers.seen.shape, -1, dtype=np.int64)
+    number[layers.seen] = np.arange(layers.seen.sum())
+    right = layers.right[:, :-1] & layers.seen[:, :-1] & layers.seen[:, 1:]
+    down = layers.down[:-1] & layers.seen[:-1] & layers.seen[1:]
+    a = np.concatenate([number[:, :-1][right], number[:-1][down]])
+    b = np.concatenate([number[:, 1:][right], number[1:][down]])
+    graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(number.max() + 1, number.max() + 1))
+    number[layers.seen] = connected_components(graph, directed=False)[1]
+    return number
 
 
 def _turned_to(uv: Float, xy: Float) -> Float:

@@ -316,7 +316,7 @@ def _to_rays(
     """Fits as depth along the rays, by implicit differentiation of w - f(u, v) = 0."""
     depth = rays.to_grid(centre)[1]
     good = np.ones(len(rc), bool)
-    for _ in range(6):
+    for _ in range(4):
         gradient, _, value = _implicit(rays, rc, depth, centre, axes, surface, width_m)
         slope = gradient[:, 2]
         steep = np.abs(slope) * width_m < 0.1 * np.linalg.norm(rays.rays(rc), axis=1)

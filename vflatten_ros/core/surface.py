@@ -131,11 +131,11 @@ def _assemble(
 
 
 def _special(layers: Layers, fits: Float, cell: float, reach: int) -> Bool:
-    """Places near a jump or steeper than 50 degrees."""
+    """Places near a jump or steeper than 60 degrees."""
     cut = np.zeros(layers.valid.shape, bool)
     cut[:, :-1] |= layers.valid[:, :-1] & layers.valid[:, 1:] & ~layers.smooth_right[:, :-1]
     cut[:-1] |= layers.valid[:-1] & layers.valid[1:] & ~layers.smooth_down[:-1]
-    steep = np.hypot(fits[..., 1], fits[..., 2]) > 1.2 * cell
+    steep = np.hypot(fits[..., 1], fits[..., 2]) > 1.7 * cell
     return np.asarray(layers.valid & ~layers.bridged & (maximum_filter(cut, 2 * reach + 1) | steep))
 
 

@@ -1,0 +1,324 @@
+#!/usr/bin/env python3
+"""How far results are from the truth of simulated recordings: writes docs/accuracy.md.
+
+    accuracy.py [FOLDER ...] [--protocol] [--calibration-error] [--output FILE]
+
+Each FOLDER is a recording with truth.json and truth.npz, or holds such recordings (default: bags/).
+The truth is read only after the result is there, to compare.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from vflatten_ros.core.config import Config
+from vflatten_ros.core.errors import VFlattenError
+from vflatten_ros.core.geometry import rotation_about
+from vflatten_ros.figures import DPI, flattening_figure
+from vflatten_ros.replay import replay_recording
+from vflatten_ros.results import garment_result
+
+Float = NDArray[np.float64]
+ROOT = Path(__file__).resolve().parent.parent
+PIXEL_M = 0.002  # raster of the overlap
+AXIS_SHIFT_M, AXIS_TILT_RAD = 0.003, np.radians(0.5)  # of --calibration-error
+FAILED_SIZE_PCT = 7.0  # a size further off than this is drawn
+
+HEAD = """# Accuracy
+
+Written by `make accuracy`; do not edit.
+
+Recordings of simulated garments (bags/README.md says how), compared with what the simulation knows.
+Real items will do worse in ways that only real recordings can show. Sizes are signed errors in per
+cent, with how many stated standard deviations they are. Points and landmarks: median distance to
+the truth. Overlap: intersection over union with the true outline. Seconds: opening, reading and
+all stages on the machine that wrote this page.
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One recording compared with its truth."""
+
+    name: str
+    true_category: str
+    category: str
+    trusted: bool
+    error_pct: Mapping[str, float | None]  # "W", "L"
+    in_sigmas: Mapping[str, float | None]
+    point_median_m: float | None
+    overlap: float | None
+    landmark_median_m: float | None
+    seconds: float
+    notes: tuple[str, ...]
+
+    @property
+    def right(self) -> bool:
+        return self.category == self.true_category
+
+    @property
+    def failed(self) -> bool:
+        sizes = [e for e in self.error_pct.values() if e is not None]
+        return not self.right or any(abs(e) > FAILED_SIZE_PCT for e in sizes)
+
+
+def main() -> int:
+    """Replay, compare, write the page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folders", type=Path, nargs="*", default=[ROOT / "bags"])
+    parser.add_argument("--protocol", action="store_true", help="the paper's two views and points")
+    parser.add_argument(
+        "--calibration-error", action="store_true", help="axis 3 mm and 0.5 degrees off"
+    )
+    parser.add_argument("--output", type=Path, default=ROOT / "docs" / "accuracy.md")
+    args = parser.parse_args()
+    pictures = args.output.with_suffix("")
+    rows = []
+    for folder in recordings(args.folders):
+        print(folder.name, file=sys.stderr)
+        rows.append(compare(folder, args.protocol, args.calibration_error, pictures))
+    if not rows:
+        print("accuracy: no recording with truth.json in the folders given", file=sys.stderr)
+        return 1
+    args.output.write_text(page(rows, args, pictures.name), encoding="utf-8")
+    print(args.output)
+    return 0
+
+
+def recordings(folders: Sequence[Path]) -> Iterator[Path]:
+    """Every recording with a truth, in order of name."""
+    for folder in folders:
+        if (folder / "truth.json").is_file():
+            yield folder
+        else:
+            yield from sorted(path.parent for path in folder.glob("*/truth.json"))
+
+
+def compare(folder: Path, protocol: bool, off: bool, pictures: Path) -> Row:
+    """Flatten one recording, then read its truth."""
+    config = dataclasses.replace(Config(), method="kita2019" if protocol else "rotation")
+    started = time.perf_counter()
+    result: dict[str, Any] = {}
+    notes: list[str] = []
+    replayed = None
+    with tempfile.TemporaryDirectory() as scratch:
+        calibration = misplaced(folder, Path(scratch)) if off else None
+        given = folder / "protocol.json" if protocol else None
+        try:
+            replayed = replay_recording(folder, config, calibration=calibration, protocol=given)
+            result = garment_result(replayed.garment, replayed.views)
+            notes += [notice["code"] for notice in result["notices"]]
+        except VFlattenError as error:
+            notes.append(str(error))
+    seconds = time.perf_counter() - started
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    row = judged(folder, truth, result, seconds, tuple(notes))
+    if row.failed and replayed is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
+        figure = flattening_figure(replayed.garment)
+        figure.savefig(pictures / f"{row.name}.png", dpi=0.7 * DPI, metadata={"Software": None})
+    return row
+
+
+def misplaced(folder: Path, scratch: Path) -> Path:
+    """A calibration whose axis is off; the direction of the error depends on the name alone."""
+    values = yaml.safe_load((folder / "calibration.yaml").read_text(encoding="utf-8"))
+    random = np.random.default_rng(list(folder.name.encode()))
+    up = np.array(values["axis_direction"])
+    side = np.cross(up, random.normal(size=3))
+    side /= np.linalg.norm(side)
+    for key in ("axis_point", "gripper_tip"):
+        values[key] = (np.array(values[key]) + AXIS_SHIFT_M * side).tolist()
+    values["axis_direction"] = (rotation_about(side, AXIS_TILT_RAD) @ up).tolist()
+    path = scratch / "calibration.yaml"
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    return path
+
+
+def judged(
+    folder: Path,
+    truth: Mapping[str, Any],
+    result: Mapping[str, Any],
+    seconds: float,
+    notes: tuple[str, ...],
+) -> Row:
+    """Errors of one result."""
+    errors: dict[str, float | None] = {}
+    sigmas: dict[str, float | None] = {}
+    for letter, key in (("W", "width"), ("L", "length")):
+        value, sigma = result.get(f"{key}_m"), result.get(f"{key}_sigma_m")
+        errors[letter] = None if value is None else 100.0 * (value / truth[letter] - 1.0)
+        sigmas[letter] = abs(value - truth[letter]) / sigma if value and sigma else None
+    moved, median = aligned(folder, result)
+    outline = np.array(truth["outline"])
+    return Row(
+        name=folder.name,
+        true_category=truth["category"],
+        category=result.get("category", "failed"),
+        trusted=bool(result.get("trusted", False)),
+        error_pct=errors,
+        in_sigmas=sigmas,
+        point_median_m=median,
+        overlap=None if moved is None else overlap(moved, outline),
+        landmark_median_m=landmark_error(truth, result),
+        seconds=seconds,
+        notes=notes,
+    )
+
+
+def aligned(folder: Path, result: Mapping[str, Any]) -> tuple[Float | None, float | None]:
+    """The outline moved onto the truth as the points fit it best, and their median error."""
+    points = result.get("points")
+    if not points or not points["u"]:
+        return None, None
+    with np.load(folder / "truth.npz") as pixels:
+        shape = [
+            int(max(pixels[key].max(), max(points[key]))) + 1 for key in ("view", "row", "col")
+        ]
+        place = np.full(shape, -1)
+        place[pixels["view"], pixels["row"], pixels["col"]] = np.arange(len(pixels["u"]))
+        index = place[points["view"], points["row"], points["col"]]
+        true = np.c_[pixels["u"], pixels["v"]].astype(float)[index[index >= 0]]
+    flat = np.c_[points["u"], points["v"]][index >= 0]
+    keep = np.ones(len(flat), dtype=bool)
+    for _ in range(4):  # the farthest tenth does not decide the pose
+        center, target = flat[keep].mean(axis=0), true[keep].mean(axis=0)
+        left, _, right = np.linalg.svd((flat[keep] - center).T @ (true[keep] - target))
+        turn = left @ right  # mirror images are allowed: the two sides look alike
+        distance = np.linalg.norm((flat - center) @ turn + target - true, axis=1)
+        keep = distance <= np.quantile(distance, 0.9)
+    outline = np.array(result["contour_uv"]).reshape(-1, 2)
+    return (outline - center) @ turn + target, float(np.median(distance))
+
+
+def overlap(a: Float, b: Float) -> float:
+    """Intersection over union of two polygons."""
+    low = np.minimum(a.min(axis=0), b.min(axis=0)) - 2 * PIXEL_M
+    size = np.ceil((np.maximum(a.max(axis=0), b.max(axis=0)) - low) / PIXEL_M).astype(int) + 2
+    images = []
+    for polygon in (a, b):
+        image = np.zeros(size[::-1], dtype=np.uint8)
+        cv2.fillPoly(image, [np.rint((polygon - low) / PIXEL_M).astype(np.int32)], 1)
+        images.append(image > 0)
+    return float((images[0] & images[1]).sum() / max(int((images[0] | images[1]).sum()), 1))
+
+
+def landmark_error(truth: Mapping[str, Any], result: Mapping[str, Any]) -> float | None:
+    """Median distance of the hanging landmarks that some view shows; left and right may change."""
+    rotation, shift = (np.array(truth["wrist_to_optical"][key]) for key in "Rt")
+    given = {m["name"]: m["xyz"] for m in result.get("landmarks", ()) if m["xyz"] is not None}
+    mirrored = {"left": "right", "right": "left"}
+    medians = []
+    for swap in (False, True):
+        found = []
+        for name, mark in truth["landmarks"].items():
+            side, _, rest = name.partition("_")
+            asked = f"{mirrored[side]}_{rest}" if swap and side in mirrored else name
+            if any(mark["visible"]) and asked in given:
+                true = rotation @ np.array(mark["hanging"]) + shift
+                found.append(float(np.linalg.norm(np.array(given[asked]) - true)))
+        if found:
+            medians.append(float(np.median(found)))
+    return min(medians, default=None)
+
+
+def page(rows: Sequence[Row], args: argparse.Namespace, pictures: str) -> str:
+    """Text of the page."""
+    how = [
+        "The paper's two views and corresponding points, `method: kita2019`."
+        if args.protocol
+        else "All views, no manual input, `method: rotation`."
+    ]
+    if args.calibration_error:
+        how.append("The calibration's axis was moved by 3 mm and tilted by 0.5 degrees.")
+    lines = [HEAD, " ".join(how), "", *table(rows), "", *figures_of_merit(rows), ""]
+    for row in (row for row in rows if row.failed):
+        lines += [f"## {row.name}", "", "; ".join(row.notes) or "no notice", ""]
+        if row.category != "failed":
+            lines += [f"![flattened {row.name}]({pictures}/{row.name}.png)", ""]
+    return "\n".join(lines)
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """One line a recording."""
+    names = [
+        "recording",
+        "category",
+        "W",
+        "L",
+        "points",
+        "overlap",
+        "landmarks",
+        "trusted",
+        "seconds",
+    ]
+    lines = ["| " + " | ".join(names) + " |", "|" + " --- |" * len(names)]
+    for row in rows:
+        category = row.category if row.right else f"**{row.category}**, is {row.true_category}"
+        cells = [
+            row.name,
+            category.replace("_", " "),
+            *(_size(row, letter) for letter in "WL"),
+            _centimetres(row.point_median_m),
+            "" if row.overlap is None else f"{row.overlap:.3f}",
+            _centimetres(row.landmark_median_m),
+            "yes" if row.trusted else "no",
+            f"{row.seconds:.1f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def _size(row: Row, letter: str) -> str:
+    error, sigmas = row.error_pct[letter], row.in_sigmas[letter]
+    return "" if error is None or sigmas is None else f"{error:+.1f} % ({sigmas:.1f} σ)"
+
+
+def _centimetres(value_m: float | None) -> str:
+    return "" if value_m is None else f"{100 * value_m:.2f} cm"
+
+
+def figures_of_merit(rows: Sequence[Row]) -> list[str]:
+    """The means, over all recordings and over those that the result itself trusts."""
+    lines = []
+    for name, part in (("all", rows), ("trusted", [row for row in rows if row.trusted])):
+        sizes = [abs(e) for row in part for e in row.error_pct.values() if e is not None]
+        sigmas = [s for row in part for s in row.in_sigmas.values() if s is not None]
+        if not sizes:
+            continue
+        lines += [
+            f"- {name}, {len(part)} recordings: category right {sum(r.right for r in part)}; "
+            f"W and L given {len(sizes)} of {2 * len(part)}, error mean {np.mean(sizes):.1f} %, "
+            f"worst {max(sizes):.1f} %; within one σ {_share(sigmas, 1)}, within two "
+            f"{_share(sigmas, 2)}; means: points {_centimetres(_mean(part, 'point_median_m'))}, "
+            f"overlap {_mean(part, 'overlap') or 0:.3f}, "
+            f"landmarks {_centimetres(_mean(part, 'landmark_median_m'))}"
+        ]
+    return lines
+
+
+def _share(sigmas: Sequence[float], limit: float) -> str:
+    return f"{100 * np.mean(np.array(sigmas) <= limit):.0f} %"
+
+
+def _mean(rows: Sequence[Row], name: str) -> float | None:
+    values = [v for row in rows if (v := getattr(row, name)) is not None]
+    return float(np.mean(values)) if values else None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

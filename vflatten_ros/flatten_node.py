@@ -208,7 +208,8 @@ class FlattenNode(AnsweringLifecycleNode):
             log.info(f"rotation complete: {event.views} views")
         elif isinstance(event, ClockJumped):
             back = (event.from_ns - event.to_ns) * 1e-9
-            log.warning(f"stamps went back by {back:.3f} s: the views of before are forgotten")
+            text = f"stamps went back by {back:.3f} s: the views of before are forgotten"
+            self.warn("clock", text)
         elif isinstance(event, CloudDropped) and event.reason not in ("duplicate_angle", "cleared"):
             self.warn(event.reason, f"cloud {event.view_id} dropped, {event.reason}: {event.text}")
 

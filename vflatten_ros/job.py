@@ -15,7 +15,13 @@ from vflatten_ros.worker import Job, Work
 
 def prepare(categories: str) -> Work:
     """Load the categories of a folder ("": those of the package)."""
-    import vflatten_ros.core.pipeline  # noqa: F401  now, so that the first job need not wait for it
+    # now, so that the first job need not wait for them
+    import rclpy.serialization  # noqa: F401
+    from visualization_msgs.msg import MarkerArray
+
+    import vflatten_ros.core.pipeline  # noqa: F401
+
+    MarkerArray()
 
     return partial(flatten, load_templates(categories or None))
 

@@ -11,7 +11,8 @@ from vflatten_ros.core.values import Byte, FlatGarment, Float, Measurement
 PIXELS_PER_M = 800.0
 MARGIN_PX = 60
 MAX_SIDE_PX = 2000
-HEADER_PX = 70
+HEADER_PX = 90
+LABEL_PX = 120  # names to the right of the outermost points
 
 # red, green, blue; colour-blind-safe (Okabe and Ito 2008)
 BLUE, ORANGE, VERMILION = (0, 114, 178), (230, 159, 0), (213, 94, 0)
@@ -47,8 +48,7 @@ def _titles(garment: FlatGarment) -> list[str]:
     score = garment.scores.get(garment.category)
     first = garment.category if score is None else f"{garment.category} ({score:.2f})"
     second = f"{garment.method}, {len(garment.view_ids)} views, {garment.coverage:.0%} seen"
-    notices = ", ".join(notice.code for notice in garment.notices)
-    return [first, f"{second}; {notices}" if notices else second]
+    return [first, second, ", ".join(notice.code for notice in garment.notices)]
 
 
 class _Canvas:
@@ -62,6 +62,7 @@ class _Canvas:
         size = np.maximum(high - self._low, 0.05)
         self._scale = min(PIXELS_PER_M, (MAX_SIDE_PX - 2 * MARGIN_PX) / float(size.max()))
         width, height = np.ceil(size * self._scale).astype(int) + 2 * MARGIN_PX
+        width += LABEL_PX
         self._height = int(height) + HEADER_PX
         self.image: Byte = np.full((self._height, max(int(width), 420), 3), 255, np.uint8)
 

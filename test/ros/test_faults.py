@@ -195,7 +195,8 @@ def test_a_flattening_process_that_is_killed_costs_one_goal(rig):
     rig.serves_a_good_rotation()
 
 
-def test_a_node_killed_in_mid_rotation_serves_after_its_restart(ros, tmp_path):
+def test_a_node_killed_in_mid_rotation_serves_after_its_restart(shared_rig, tmp_path):
+    before = shared_rig.diagnostics()["clouds"]["received"]
     arguments = ["--calibration", str(CALIBRATION), "--ros-args", "-p", "use_sim_time:=true"]
     rig = Rig(tmp_path, arguments=arguments)
     try:
@@ -210,6 +211,8 @@ def test_a_node_killed_in_mid_rotation_serves_after_its_restart(ros, tmp_path):
         assert rig.buffer().clouds_received == 0
         rig.serves_a_good_rotation()
         (worker,) = rig.node.children()
+        # two rigs side by side: the other one has heard nothing of this
+        assert shared_rig.diagnostics()["clouds"]["received"] == before
         assert rig.node.stop(signal.SIGTERM) == 0
         with pytest.raises(ProcessLookupError):
             os.kill(worker, 0)

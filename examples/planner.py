@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """What a task planner does: watch the views come in, give corresponding points, flatten, go on.
 
-    vflatten node --calibration bags/LS1/calibration.yaml &
-    python3 examples/planner.py bags/LS1
+    vflatten node --calibration bags/LS1_1/calibration.yaml &
+    python3 examples/planner.py bags/LS1_1
 
 Without --no-play it turns the item itself, that is: it plays the recording.
 """

@@ -307,7 +307,9 @@ def _landmark(garment: FlatGarment, name: str) -> Landmark:
         if mark.name == name:
             return mark
     known = ", ".join(mark.name for mark in garment.landmarks) or "none"
-    raise Refused(UNKNOWN_NAME, f"a {garment.category} has no landmark {name!r}; it has: {known}")
+    raise Refused(
+        UNKNOWN_NAME, f"a {garment.category} has no landmark {name[:60]!r}; it has: {known}"
+    )
 
 
 def _angle(session: Session, request: Any) -> float:

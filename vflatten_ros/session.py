@@ -149,7 +149,8 @@ class Session:
         """What to flatten now. Raises Refused."""
         if method and method not in METHODS:
             raise Refused(
-                UNKNOWN_NAME, f"method {method!r} does not exist; methods: {', '.join(METHODS)}"
+                UNKNOWN_NAME,
+                f"method {method[:60]!r} does not exist; methods: {', '.join(METHODS)}",
             )
         if method:
             config = dataclasses.replace(config, method=method)

@@ -196,7 +196,7 @@ def slit(x: Float, y: Float) -> Bool:
 
 
 def flap(raise_m: float = 0.03, step_m: float = STEP_M) -> tuple[Patch, Bool]:
-    """A flat cloth with a flap 80 mm wide lying `raise_m` in front of it, and which points it has."""
+    """A flat cloth, a flap 80 mm wide `raise_m` in front of it, and which points are the flap's."""
     sheet = _seen(
         "flap", lambda x, y: np.where(np.abs(x) < 0.04, raise_m, 0.0), lambda x, y: (x, y),
         lambda u, v: (u, v), everywhere, (-0.15, 0.15, -0.1, 0.1), 0.0, step_m,

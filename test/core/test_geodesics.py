@@ -130,7 +130,7 @@ def test_unorganised_points_do_as_well():
 
 
 def test_a_line_across_a_raised_flap_says_so():
-    patch, on_flap = synthetic.flap()
+    patch, _ = synthetic.flap()
     x = patch.flat[:, 0]
     pairs = patch.pairs(60, among=x < -0.06, to=x > 0.06, low_m=0.1)
     lines = lines_of(patch, pairs, 0.001)
@@ -140,7 +140,7 @@ def test_a_line_across_a_raised_flap_says_so():
 
 
 def test_a_line_beside_a_flap_is_right():
-    patch, on_flap = synthetic.flap()
+    patch, _ = synthetic.flap()
     x = patch.flat[:, 0]
     near_edge = (x < -0.042) & (x > -0.046)
     pairs = patch.pairs(60, among=near_edge, to=x < -0.08, low_m=0.04)

@@ -63,10 +63,10 @@ def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m:
     outside = np.unique(np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]]))
     bridged = ~seen & ~small & (away > RING) & ~np.isin(holes, outside)
     valid = (away <= RING) | small | bridged
-    across = np.where(small, 8.0, 3.0)
+    reach = np.where(small, 8.0, 3.0)
     smooth, joined = [], []
     for axis in (1, 0):
-        near, close = _joined(depth, seen, points, source, across, axis, cell_m, noise_m)
+        near, close = _joined(depth, seen, points, source, reach, axis, cell_m, noise_m)
         near &= valid & np.roll(valid, -1, axis=axis)
         near[(slice(None), -1) if axis else -1] = False
         smooth.append(near)
@@ -77,7 +77,7 @@ def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m:
 
 
 def _joined(
-    depth: Float, seen: Bool, points: Float, source: Int, across: Float, axis: int,
+    depth: Float, seen: Bool, points: Float, source: Int, reach: Float, axis: int,
     cell_m: float, noise_m: float,
 ) -> Bool:  # fmt: skip
     """Whether each place and the next along the axis are on one surface, and measured near by."""
@@ -91,10 +91,12 @@ def _joined(
     both = seen & np.roll(seen, -1, axis=axis)
     # steeper places cannot be told from a jump where nothing was measured between
     near = gap < np.hypot(np.where(both, 6.0, 2.5) * cell_m * steps, 5.0 * noise_m)
-    close = steps <= np.maximum(across, np.roll(across, -1, axis=axis))
+    close = steps <= np.maximum(reach, np.roll(reach, -1, axis=axis))
     limit = max(4.0 * noise_m, 1.2 * cell_m)
+    low = max(3.2 * noise_m, 1.2 * cell_m)
     # a jump is a line of places, noise is not
-    step = (_step(depth, seen, axis, 3) > limit) & (_step(depth, seen, axis, 7) > limit / 2)
+    short, wide = (_step(depth, seen, axis, across) for across in (3, 7))
+    step = (short > limit) & (wide > limit / 2) | (wide > low)
     return np.asarray(near & ~step), np.asarray(close)
 
 
@@ -171,8 +173,10 @@ def connected_window(layers: Layers, rows: Int, cols: Int, reach: int) -> Bool:
     return reached
 
 
-def joined_places(layers: Layers, rc: Float) -> tuple[Bool, Bool]:
+def joined_places(layers: Layers, rc: Float, over_gaps: bool = False) -> tuple[Bool, Bool]:
     """Whether (m, n, 2) grid places are on observed surface, and consecutive ones on one piece.
+
+    `over_gaps`: a narrow gap without a jump does not part them.
 
     Returns
     -------
@@ -185,10 +189,12 @@ def joined_places(layers: Layers, rc: Float) -> tuple[Bool, Bool]:
     r1, c1 = place[:, 1:, 0], place[:, 1:, 1]
     left, top = np.minimum(c0, c1), np.minimum(r0, r1)
     across, along = c0 != c1, r0 != r1
-    by_col0 = ~across | layers.right[r0, left]  # first along the row of the start
-    by_col1 = ~across | layers.right[r1, left]
-    by_row0 = ~along | layers.down[top, c0]
-    by_row1 = ~along | layers.down[top, c1]
+    right = layers.smooth_right if over_gaps else layers.right
+    down = layers.smooth_down if over_gaps else layers.down
+    by_col0 = ~across | right[r0, left]  # first along the row of the start
+    by_col1 = ~across | right[r1, left]
+    by_row0 = ~along | down[top, c0]
+    by_row1 = ~along | down[top, c1]
     step = (np.abs(c1 - c0) <= 1) & (np.abs(r1 - r0) <= 1)
     joined = step & ((by_col0 & by_row1) | (by_row0 & by_col1))
     return observed, joined & observed[:, :-1] & observed[:, 1:]

@@ -88,7 +88,7 @@ def _first_guess(surface: Surface, a: Float, b: Float, nodes: int) -> tuple[Floa
     """(m, nodes, 2) lines on the observed surface where there are any, and which ends are apart."""
     t = np.linspace(0, 1, nodes)[None, :, None]
     path = a[:, None] + t * (b - a)[:, None]
-    lost = ~_open(surface, path)
+    lost = ~_open(surface, path, over_gaps=True)
     apart = np.zeros(len(a), bool)
     if lost.any():
         points = _grid_points(surface)
@@ -112,11 +112,11 @@ def _dense(path: Float, fine: int) -> Float:
     return path[:, i] * (1 - f) + path[:, i + 1] * f
 
 
-def _open(surface: Surface, path: Float) -> Bool:
+def _open(surface: Surface, path: Float, over_gaps: bool = False) -> Bool:
     """(m,) whether nothing separates the places along each line."""
     longest = np.abs(np.diff(path, axis=1)).max()
     fine = int(np.ceil(max(longest, 1e-9) / 0.8))
-    return np.asarray(joined_places(surface.layers, _dense(path, fine))[1].all(axis=1))
+    return np.asarray(joined_places(surface.layers, _dense(path, fine), over_gaps)[1].all(axis=1))
 
 
 def _points(surface: Surface, rc: Float) -> tuple[Float, Float]:
@@ -130,7 +130,7 @@ def _points(surface: Surface, rc: Float) -> tuple[Float, Float]:
 
 
 def relax_newton(surface: Surface, path: Float, progress: Progress) -> tuple[Float, Bool, Bool]:
-    """Gauss-Newton on the energy of zero-length springs: all nodes of all lines in one banded system.
+    """Gauss-Newton on the energy of zero-length springs, all nodes in one banded system.
 
     Nodes that would leave the observed surface are held where they are.
 
@@ -170,7 +170,7 @@ def _allowed(surface: Surface, path: Float, change: Float) -> tuple[Float, Bool]
     pair = np.stack([path[:, 1:-1], moved[:, 1:-1]], axis=2).reshape(-1, 2, 2)
     steps = int(np.ceil(max(float(np.abs(change).max()), 1e-9) / 0.8))
     was = joined_places(surface.layers, pair[:, :1])[0][:, 0]
-    free = joined_places(surface.layers, _dense(pair, steps))[1].all(axis=1)
+    free = joined_places(surface.layers, _dense(pair, steps), over_gaps=True)[1].all(axis=1)
     stuck = (was & ~free).reshape(change.shape[:2])
     moved[:, 1:-1][stuck] = path[:, 1:-1][stuck]
     return moved, stuck
@@ -217,7 +217,7 @@ def _describe(surface: Surface, path: Float, held: Bool, converged: Bool) -> Geo
         [broken & jumps, broken, bent, ~converged],
         # cloth behind a jump may be much longer than the way across; a hole is likely smooth;
         # a flat distance lies between the distance in space and the length round the border
-        [0.5 * bridge + 0.05 * length, 0.15 * bridge, (length - apart) / 3, 0.01 * length],
+        [0.5 * bridge + 0.05 * length, 0.2 * bridge, 0.6 * (length - apart), 0.01 * length],
         0.0,
     )
     return Geodesics(points[:, ::FINE], length, np.hypot(sigma, doubt), reason != OK, reason)
@@ -226,7 +226,7 @@ def _describe(surface: Surface, path: Float, held: Bool, converged: Bool) -> Geo
 def _gaps(
     surface: Surface, dense: Float, points: Float, segment: Float
 ) -> tuple[Float, Float, Bool]:
-    """Of each line: length between first and last break, distance across, and whether depth jumps."""
+    """Per line: length from first to last break, distance across, whether depth jumps."""
     layers = surface.layers
     place = np.clip(np.round(dense).astype(int), 0, np.array(layers.valid.shape) - 1)
     guessed = layers.bridged[place[..., 0], place[..., 1]]

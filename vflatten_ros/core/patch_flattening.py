@@ -14,13 +14,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csc_matrix, identity
+from scipy.sparse import csr_matrix, identity
 from scipy.sparse.linalg import SuperLU, splu
 
 from vflatten_ros.core.surface import Surface
 from vflatten_ros.core.values import Bool, Float, Int
 
-ROUNDS = 2
+Complex = NDArray[np.complex128]
+ROUNDS = 4
+GAP = 6  # grid steps across the widest gap that is tied
+MOST_MISFIT_M = 0.003  # a tie that misses the way around by more is none: a cut, or another layer
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,38 +35,73 @@ class FlatPatch:
     strain: Float  # (rows, cols) rms misfit of the steps to the neighbours, relative
 
 
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Steps from places a to places b, as complex numbers in the frames of both."""
+
+    a: Int
+    b: Int
+    of_a: Complex
+    of_b: Complex
+
+    def turned(self, turn: Float) -> Complex:
+        """The steps in the plane, for turns of the frames."""
+        spin = np.exp(1j * turn)
+        return np.asarray(0.5 * (spin[self.a] * self.of_a + spin[self.b] * self.of_b))
+
+
 def flatten_patch(surface: Surface) -> FlatPatch:
     """Lay every connected piece of a view's surface flat, by the measured places alone.
 
-    Places on both sides of a slit or a hole hang together around it.
+    Places on both sides of a slit or a hole hang together around it. Across a narrow gap without a
+    jump they are also tied to each other, where that agrees with the way around.
     """
     layers = surface.layers
     used = layers.seen
     number = np.full(used.shape, -1)
     number[used] = np.arange(used.sum())
-    a, b = _edges(number, used, layers.right, layers.down)
     rows, cols = np.nonzero(used)
     frames, points = _frames(surface, rows, cols)
-    step_a, step_b = _steps(points, frames, a, b)
-    certain = 1.0 / (1e-12 + surface.sigma_grid_m[rows, cols] ** 2)
-    weight = np.sqrt(certain[a] * certain[b])
-    weight /= weight.mean()
-    factor, incidence = _factor(len(rows), a, b, weight)
-    turn = factor.solve(incidence.T @ (weight * np.angle(step_a * step_b.conj())))
-    place = _place(factor, incidence, weight, turn, a, b, step_a, step_b)
-    for _ in range(ROUNDS):
-        turn = _turns(place, a, b, step_a, step_b, weight, turn)
-        place = _place(factor, incidence, weight, turn, a, b, step_a, step_b)
-    return _on_grid(used, layers.label, rows, cols, place, a, b, step_a)
+    sure = 1.0 / (1e-12 + surface.sigma_grid_m[rows, cols] ** 2)
+    sure /= sure.mean()
+
+    edges = _edges(number, layers.right, layers.down)
+    place, turn = _solve(_steps(points, frames, *edges), sure, len(rows))
+    over = _gap_edges(number, layers.smooth_right, layers.smooth_down)
+    if len(over[0]):
+        ties = _steps(points, frames, *over)
+        misfit = np.abs(place[ties.b] - place[ties.a] - ties.turned(turn))
+        agree = misfit < MOST_MISFIT_M
+        if agree.any():
+            both = (np.concatenate([e, o[agree]]) for e, o in zip(edges, over))
+            edges = (next(both), next(both))
+            place, turn = _solve(_steps(points, frames, *edges), sure, len(rows))
+    return _on_grid(used, layers.label, rows, cols, place, _steps(points, frames, *edges))
 
 
-def _edges(number: Int, used: Bool, right: Bool, down: Bool) -> tuple[Int, Int]:
+def _edges(number: Int, right: Bool, down: Bool) -> tuple[Int, Int]:
     """Pairs of joined neighbours."""
+    used = number >= 0
     right = right[:, :-1] & used[:, :-1] & used[:, 1:]
     down = down[:-1] & used[:-1] & used[1:]
     a = np.concatenate([number[:, :-1][right], number[:-1][down]])
     b = np.concatenate([number[:, 1:][right], number[1:][down]])
     return a, b
+
+
+def _gap_edges(number: Int, right: Bool, down: Bool) -> tuple[Int, Int]:
+    """Pairs on both sides of a narrow gap in a row or a column, without a jump between."""
+    first, second = [], []
+    for places, smooth in ((number, right), (number.T, down.T)):
+        clear = smooth[:, :-1]
+        for width in range(2, GAP + 1):
+            near, far = places[:, :-width], places[:, width:]
+            way = clear[:, : near.shape[1]] & (near >= 0) & (far >= 0)
+            for k in range(1, width):
+                way &= clear[:, k : k + near.shape[1]] & (places[:, k : k + near.shape[1]] < 0)
+            first.append(near[way])
+            second.append(far[way])
+    return np.concatenate(first), np.concatenate(second)
 
 
 def _frames(surface: Surface, rows: Int, cols: Int) -> tuple[Float, Float]:
@@ -78,7 +116,7 @@ def _frames(surface: Surface, rows: Int, cols: Int) -> tuple[Float, Float]:
     return frames, surface.rays.to_points(rc, fit[:, 0])
 
 
-def _steps(points: Float, frames: Float, a: Int, b: Int) -> tuple[Float, Float]:
+def _steps(points: Float, frames: Float, a: Int, b: Int) -> _Steps:
     """The step along each edge as a complex number in the frames of both ends."""
     chord = points[b] - points[a]
     length = np.linalg.norm(chord, axis=1)
@@ -91,17 +129,31 @@ def _steps(points: Float, frames: Float, a: Int, b: Int) -> tuple[Float, Float]:
         x, y = (np.einsum("ki,ki->k", frames[end, i], chord) for i in (0, 1))
         flat = x + 1j * y
         steps.append(flat * (length / np.maximum(np.abs(flat), 1e-15)))
-    return steps[0], steps[1]
+    return _Steps(a, b, steps[0], steps[1])
 
 
-def _factor(count: int, a: Int, b: Int, weight: Float) -> tuple[SuperLU, csc_matrix]:
+def _solve(steps: _Steps, sure: Float, count: int) -> tuple[Complex, Float]:
+    """(k,) complex places and (k,) turns of the frames that fit the steps best."""
+    a, b = steps.a, steps.b
+    weight = sure[a] * sure[b]  # slopes at borders, which turns depend on, are the worst known
+    factor, incidence = _factor(count, a, b, weight)
+    turn = factor.solve(incidence.T @ (weight * np.angle(steps.of_a * steps.of_b.conj())))
+    place = _place(factor, incidence, weight * steps.turned(turn))
+    for _ in range(ROUNDS):
+        turn = _turns(place, steps, weight, turn)
+        place = _place(factor, incidence, weight * steps.turned(turn))
+    return place, turn
+
+
+def _factor(count: int, a: Int, b: Int, weight: Float) -> tuple[SuperLU, csr_matrix]:
     """Factor of the weighted graph Laplacian, and the edges' differences b minus a."""
     edges = np.arange(len(a))
     ones = np.ones(len(a))
-    incidence = coo_matrix(
+    incidence = csr_matrix(
         (np.concatenate([-ones, ones]), (np.concatenate([edges, edges]), np.concatenate([a, b]))),
         shape=(len(a), count),
-    ).tocsr()
+    )
+    # a touch of the identity holds each piece in place
     laplacian = incidence.T @ incidence.multiply(weight[:, None]) + 1e-9 * identity(count)
     options = {"SymmetricMode": True}
     factor = splu(
@@ -110,41 +162,38 @@ def _factor(count: int, a: Int, b: Int, weight: Float) -> tuple[SuperLU, csc_mat
     return factor, incidence
 
 
-def _place(
-    factor: SuperLU, incidence: csc_matrix, weight: Float, turn: Float, a: Int, b: Int,
-    step_a: Float, step_b: Float,
-) -> Float:  # fmt: skip
-    """(k,) complex places whose differences are the turned steps, by least squares."""
-    spin = np.exp(1j * turn)
-    step = 0.5 * (spin[a] * step_a + spin[b] * step_b) * weight
+def _place(factor: SuperLU, incidence: csr_matrix, step: Complex) -> Complex:
+    """(k,) complex places whose differences are the steps, by least squares."""
     right = incidence.T @ np.stack([step.real, step.imag], axis=1)
     solved = factor.solve(np.ascontiguousarray(right))
     return np.asarray(solved[:, 0] + 1j * solved[:, 1])
 
 
-def _turns(
-    place: Float, a: Int, b: Int, step_a: Float, step_b: Float, weight: Float, turn: Float
-) -> Float:
+def _turns(place: Complex, steps: _Steps, weight: Float, turn: Float) -> Float:
     """The turn of every frame that fits its steps to the places best."""
-    step = (place[b] - place[a]) * weight
+    step = (place[steps.b] - place[steps.a]) * weight
     count = len(turn)
     pull = np.zeros(count, complex)
-    for end, own in ((a, step_a), (b, step_b)):
+    for end, own in ((steps.a, steps.of_a), (steps.b, steps.of_b)):
         product = step * own.conj()
         pull += np.bincount(end, product.real, count) + 1j * np.bincount(end, product.imag, count)
     return np.where(np.abs(pull) > 0, np.angle(pull), turn)
 
 
 def _on_grid(
-    used: Bool, label: NDArray[np.int32], rows: Int, cols: Int, place: Float, a: Int, b: Int,
-    step: Float,
-) -> FlatPatch:  # fmt: skip
+    used: Bool,
+    label: NDArray[np.int32],
+    rows: Int,
+    cols: Int,
+    place: Complex,
+    steps: _Steps,
+) -> FlatPatch:
     uv = np.full((*used.shape, 2), np.nan)
     uv[rows, cols] = np.stack([place.real, place.imag], axis=1)
-    error = (np.abs(place[b] - place[a]) / np.maximum(np.abs(step), 1e-12) - 1) ** 2
-    count = len(rows)
+    a, b, count = steps.a, steps.b, len(rows)
+    error = (np.abs(place[b] - place[a]) / np.maximum(np.abs(steps.of_a), 1e-12) - 1) ** 2
     total = np.bincount(a, error, count) + np.bincount(b, error, count)
-    edges = np.maximum(np.bincount(a, minlength=count) + np.bincount(b, minlength=count), 1)
+    edges = np.bincount(a, minlength=count) + np.bincount(b, minlength=count)
     strain = np.zeros(used.shape)
-    strain[rows, cols] = np.sqrt(total / edges)
+    strain[rows, cols] = np.sqrt(total / np.maximum(edges, 1))
     return FlatPatch(uv, np.where(used, label, -1).astype(np.int32), strain)

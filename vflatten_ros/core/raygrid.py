@@ -1,8 +1,8 @@
 """The viewing rays of one observation as a regular grid, so that a view's surface is a depth image.
 
 A point is (row, col, depth): P = origin + row * e_row + col * e_col + depth * ray(row, col), with
-ray = ray0 + row * ray_row + col * ray_col. A pinhole camera has e_row = e_col = 0, parallel viewing
-has ray_row = ray_col = 0. Measuring noise is along the rays, which is why smoothing works on depths.
+ray = ray0 + row * ray_row + col * ray_col. A pinhole camera has e_row = e_col = 0, parallel
+viewing has ray_row = ray_col = 0. Noise is along the rays: smoothing works on depths.
 """
 
 from __future__ import annotations

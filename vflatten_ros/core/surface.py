@@ -14,6 +14,7 @@ from vflatten_ros.core.breaks import Layers, connected_window, find_layers, near
 from vflatten_ros.core.config import SurfaceConfig
 from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.raygrid import RayGrid, camera_rays, parallel_rays
+from vflatten_ros.core.rulings import average_along_rulings
 from vflatten_ros.core.smoothing import (
     fill_holes,
     noise_inflation,
@@ -23,9 +24,8 @@ from vflatten_ros.core.smoothing import (
     tangent_fits,
     value_at,
 )
-from vflatten_ros.core.rulings import average_along_rulings
-from vflatten_ros.core.weighted_planes import linear_fit, view_frame
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
+from vflatten_ros.core.weighted_planes import linear_fit, view_frame
 
 CHUNK = 4000  # places fitted at a time, so that the arrays stay in the cache
 REACH = 5  # grid steps to each side in a fit in the tangent frame

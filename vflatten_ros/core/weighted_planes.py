@@ -1,4 +1,4 @@
-"""The paper's linear moving least squares z(x, y) with a fourth-order spline weight (eqs. 2 to 5)."""
+"""The paper's moving least squares: planes z(x, y), fourth-order spline weight (eqs. 2 to 5)."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import signal
 import sys
 import traceback
@@ -45,8 +46,7 @@ def main(argv: Sequence[str] | None = None, prepare: Callable[[str], Prepare] | 
     Parameters
     ----------
     argv : sequence of str, optional
-        `--params-file FILE` and `--name NAME`, or ROS arguments after `--ros-args`; by default
-        those of the command line.
+        Options, and ROS arguments after `--ros-args`; by default those of the command line.
     prepare : callable, optional
         What flattens instead of the method; for tests.
 
@@ -75,27 +75,35 @@ def main(argv: Sequence[str] | None = None, prepare: Callable[[str], Prepare] | 
     return 0
 
 
+def parser() -> argparse.ArgumentParser:
+    """Options of the command."""
+    options = argparse.ArgumentParser(
+        prog="vflatten node",
+        description="Run the live node; docs/node.md describes it.",
+        epilog="ROS arguments (parameters, remapping, namespace) follow after --ros-args.",
+        allow_abbrev=False,
+    )
+    options.add_argument("--params-file", metavar="FILE", help="settings, as config/vflatten.yaml")
+    options.add_argument(
+        "--calibration", metavar="FILE", help="calibration.yaml of rig and gripper"
+    )
+    options.add_argument("--name", help="name of the node (default vflatten)")
+    return options
+
+
 def _ros_arguments(argv: Sequence[str]) -> list[str]:
-    """Our own short options as ROS arguments; everything from --ros-args on stays as it is."""
+    """Our own options as ROS arguments; everything from --ros-args on stays as it is."""
     given = list(argv)
     at = given.index("--ros-args") if "--ros-args" in given else len(given)
-    own, ros = given[:at], given[at:]
-    extra: list[str] = []
-    while own:
-        option = own.pop(0)
-        name, _, value = option.partition("=")
-        if name not in ("--params-file", "--name", "--calibration") or not (value or own):
-            raise SystemExit(
-                f"vflatten node: unknown option {option!r}; usage: vflatten node "
-                "[--params-file FILE] [--calibration FILE] [--name NAME] [--ros-args ...]"
-            )
-        value = value or own.pop(0)
-        extra += {
-            "--params-file": ["--params-file", value],
-            "--name": ["-r", f"__node:={value}"],
-            "--calibration": ["-p", f"calibration.file:={value}"],
-        }[name]
-    return [*(ros or (["--ros-args"] if extra else [])), *extra]
+    args = parser().parse_args(given[:at])
+    own: list[str] = []
+    if args.params_file:
+        own += ["--params-file", args.params_file]
+    if args.name:
+        own += ["-r", f"__node:={args.name}"]
+    if args.calibration:
+        own += ["-p", f"calibration.file:={args.calibration}"]
+    return [*given[at:], *(["--ros-args", *own] if own else [])]
 
 
 if __name__ == "__main__":

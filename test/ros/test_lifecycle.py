@@ -167,16 +167,16 @@ def test_a_finalized_node_still_answers(rig):
 
 
 @pytest.mark.parametrize(
-    "arguments, reason",
+    "arguments, code, reason",
     [
-        (["--ros-args", "-p", "geodesics.nodes:=1"], "geodesics.nodes"),
-        (["--ros-args", "-p", "method:=5"], "method"),
-        (["--nonsense"], "unknown option '--nonsense'"),
+        (["--ros-args", "-p", "geodesics.nodes:=1"], 1, "geodesics.nodes"),
+        (["--ros-args", "-p", "method:=5"], 1, "method"),
+        (["--nonsense"], 2, "--nonsense"),
     ],
 )
-def test_a_wrong_start_ends_with_one_line(tmp_path, arguments, reason):
+def test_a_wrong_start_ends_with_one_line(tmp_path, arguments, code, reason):
     process = Process([*REAL, *arguments], tmp_path / "log")
-    assert process.wait() == 1
-    (line,) = [line for line in process.log().splitlines() if "vflatten node:" in line]
+    assert process.wait() == code
+    (line,) = [line for line in process.log().splitlines() if "vflatten node: " in line]
     assert reason in line
     assert "Traceback" not in process.log()

@@ -79,7 +79,7 @@ def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m:
 def _joined(
     depth: Float, seen: Bool, points: Float, source: Int, reach: Float, axis: int,
     cell_m: float, noise_m: float,
-) -> Bool:  # fmt: skip
+) -> tuple[Bool, Bool]:  # fmt: skip
     """Whether each place and the next along the axis are on one surface, and measured near by."""
     flat = points.reshape(-1, 3)
     other = np.roll(source, -1, axis=axis)

@@ -68,9 +68,8 @@ def geodesic_lines(
         raise InvalidInput(f"starts and ends differ in number: {len(starts)} and {len(ends)}")
     if not len(starts):
         none = np.zeros(0)
-        return Geodesics(
-            np.zeros((0, config.nodes, 3)), none, none, none > 0, none.astype(np.uint8)
-        )
+        nodes = np.zeros((0, config.nodes, 3))
+        return Geodesics(nodes, none, none, none > 0, none.astype(np.uint8))
     a, b = surface.rays.to_grid(starts)[0], surface.rays.to_grid(ends)[0]
     path, apart = _first_guess(surface, a, b, config.nodes)
     progress("geodesics", 0.3)
@@ -99,7 +98,7 @@ def _first_guess(surface: Surface, a: Float, b: Float, nodes: int) -> tuple[Floa
 
 
 def _grid_points(surface: Surface) -> Float:
-    places = np.stack(np.indices(surface.layers.valid.shape), axis=-1).astype(float)
+    places = np.moveaxis(np.indices(surface.layers.valid.shape), 0, -1).astype(float)
     return surface.rays.to_points(places, surface.fits[..., 0])
 
 
@@ -109,7 +108,7 @@ def _dense(path: Float, fine: int) -> Float:
     t = np.linspace(0, n - 1, (n - 1) * fine + 1)
     i = np.minimum(t.astype(int), n - 2)
     f = (t - i)[None, :, None]
-    return path[:, i] * (1 - f) + path[:, i + 1] * f
+    return np.asarray(path[:, i] * (1 - f) + path[:, i + 1] * f)
 
 
 def _open(surface: Surface, path: Float, over_gaps: bool = False) -> Bool:

@@ -156,7 +156,7 @@ def _blend(
     spread: Float,
     cell_m: float,
 ) -> tuple[Float, Float]:
-    """Each window counts by its squared error, bias (from the data) and noise, squared and inverted."""
+    """Each window counts by its inverse squared error: of noise, and of bias that the data show."""
     own, own_variance = fits[rows, cols], variance[rows, cols]
     mass = np.zeros(variance.shape)
     mass[rows, cols] = 1.0

@@ -113,11 +113,8 @@ def noise_inflation(residual: Float, seen: Bool, width: float) -> float:
         (share, offset), *_ = np.linalg.lstsq(shape, found, rcond=None)
         misfit = float(((shape @ (share, offset) - found) ** 2).sum())
         if misfit < best:
-            share = (
-                float(np.clip((share + offset) / (1 + offset), 0.0, 1.0))
-                if offset < 0
-                else float(np.clip(share, 0, 1))
-            )
+            taken = min(offset, 0.0)
+            share = float(np.clip((share + taken) / (1 + taken), 0.0, 1.0))
             spread = 4 * np.pi * scale**2 * width**2 / (width**2 + scale**2)
             best, inflation = misfit, 1 + share * max(spread - 1, 0.0)
     return inflation
@@ -264,7 +261,7 @@ def _widening(rays: RayGrid, rc: Float, normal: Float) -> Float:
     """(k,) how much wider fits are where the rays hit the surface, and so sample it, obliquely."""
     ray = rays.rays(rc)
     cosine = np.abs(np.einsum("ik,ki->k", normal, ray)) / np.linalg.norm(ray, axis=1)
-    return np.clip(OBLIQUE / np.maximum(cosine, 1e-9), 1.0, WIDEST)
+    return np.asarray(np.clip(OBLIQUE / np.maximum(cosine, 1e-9), 1.0, WIDEST))
 
 
 def plane_fits(rays: RayGrid, rc: Float, foot: Float, normal: Float) -> Float:

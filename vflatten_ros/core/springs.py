@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vflatten_ros.core.surface import Surface
+from vflatten_ros.core.surface import Surface, depth_at
 from vflatten_ros.core.values import Bool, Float, Progress
 from vflatten_ros.core.weighted_planes import linear_fit, view_frame
 
@@ -14,7 +14,7 @@ STEPS = 4000
 TOLERANCE = 5e-5  # relative change of length over 20 steps
 
 
-def relax_springs(surface: Surface, path: Float, progress: Progress) -> tuple[Float, Bool, Float]:
+def relax_springs(surface: Surface, path: Float, progress: Progress) -> tuple[Float, Bool, Bool]:
     """Zero-length springs with tangential forces (eq. 6), all lines at once.
 
     Parameters
@@ -27,7 +27,7 @@ def relax_springs(surface: Surface, path: Float, progress: Progress) -> tuple[Fl
     nodes (m, M, 3), held (m, M) nodes without enough points around them, converged (m,)
     """
     frame = view_frame(surface.toward)
-    depth = surface.fits[..., 0][tuple(np.round(path).astype(int).reshape(-1, 2).T)]
+    depth, _, _ = depth_at(surface, path.reshape(-1, 2))
     start = surface.rays.to_points(path, depth.reshape(path.shape[:2])) @ frame.T
     points = surface.raw @ frame.T
     tree = cKDTree(points[:, :2])

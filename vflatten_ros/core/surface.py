@@ -93,7 +93,7 @@ def fit_surface(
     width = max(config.radius_m / 1.75 / cell, 1.2)
     fits, gain = quadratic_image(image, seen, near_measured(seen), width)
     noise = 1.4826 * float(np.median(np.abs(image - fits[..., 0])[seen]))
-    places = np.stack(np.indices(seen.shape), axis=-1).astype(float)
+    places = np.moveaxis(np.indices(seen.shape), 0, -1).astype(float)
     measured = rays.to_points(places, image)
     layers = find_layers(image, seen, measured, cell, noise)
     progress("surface", 0.5)
@@ -292,7 +292,11 @@ def depth_at(surface: Surface, rc: Float) -> tuple[Float, Float, Bool]:
         d_mass += dw
     depth = top / mass
     slope = (d_top - depth[:, None] * d_mass) / mass[:, None]
-    return depth, slope, mass > 1e-9
+    observed = mass > 1e-9
+    lost = ~observed  # as deep as the nearest measured place
+    depth[lost] = flat[surface.layers.source.ravel()[corner[lost]], 0]
+    slope[lost] = 0.0
+    return depth, slope, observed
 
 
 def _corners(layers: Layers, corner: Int, far: Bool) -> Bool:

@@ -19,7 +19,7 @@ def view_frame(toward: Float) -> Float:
 def spline_weight(s: Float) -> Float:
     """Fourth-order spline 1 - 6 s^2 + 8 s^3 - 3 s^4 of s = r / r0, zero beyond 1."""
     inside = np.minimum(s, 1.0)
-    return 1 - 6 * inside**2 + 8 * inside**3 - 3 * inside**4
+    return np.asarray(1 - 6 * inside**2 + 8 * inside**3 - 3 * inside**4)
 
 
 def linear_fit(

@@ -142,7 +142,7 @@ class Rig:
             self.until(lambda: self.lifecycle_state() == 3, "active")
         return self.node
 
-    def turn(self, rate=6, keep=lambda message: True):
+    def turn(self, rate=12, keep=lambda message: True):
         """Publish the recording from this process: no start-up, no discovery."""
         self.connect()
         self.turntable.play(filter(keep, recorded()), rate)

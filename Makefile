@@ -10,7 +10,7 @@ PYTHON ?= python3
 # Runs what follows in the built package's environment.
 IN_ENV := source env.sh;
 
-.PHONY: help bootstrap demo test check format bench bench-peers reproduce docs lock clean
+.PHONY: help bootstrap demo test check format bench bench-peers reproduce accuracy docs lock clean
 
 help:  ## This list
 	@sed -nE 's/^([a-z-]+):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -43,6 +43,9 @@ bench-peers: build/peers/ready  ## Against other libraries: docs/benchmarks.md (
 reproduce: bootstrap  ## The paper's experiments: docs/reproduction.md
 	@$(IN_ENV) python benchmarks/reproduce.py $(ARGS)
 
+accuracy: bootstrap  ## Errors over recordings with known sizes: docs/accuracy.md (RECORDINGS="DIR ...")
+	@$(IN_ENV) python benchmarks/accuracy.py $(RECORDINGS) $(ARGS)
+
 docs: bootstrap  ## Regenerate docs/parameters.md from the defaults in the code
 	@$(IN_ENV) python -m vflatten_ros.parameters > build/parameters.md; mv build/parameters.md docs/
 
@@ -65,9 +68,3 @@ build/peers/ready: requirements/peers.txt
 	@$(PYTHON) -m venv build/peers
 	@build/peers/bin/pip install --quiet --disable-pip-version-check --require-hashes --no-deps -r $<
 	@touch $@
-
-ifneq ($(wildcard benchmarks/accuracy.py),)
-.PHONY: accuracy
-accuracy: bootstrap  ## Errors over many recordings: docs/accuracy.md (RECORDINGS="DIR ...")
-	@$(IN_ENV) python benchmarks/accuracy.py $(RECORDINGS) $(ARGS)
-endif

@@ -33,6 +33,11 @@ class RayGrid:
         """Whether all rays have one direction."""
         return not self.ray_row.any()
 
+    def spacing(self, depth: float) -> float:
+        """Metres across the rays from one grid line to the next."""
+        row, col = self.e_row + depth * self.ray_row, self.e_col + depth * self.ray_col
+        return float(np.sqrt(np.linalg.norm(row) * np.linalg.norm(col)))
+
     def rays(self, rc: Float) -> Float:
         """(..., 3) ray (not of unit length) at (..., 2) grid places."""
         ray: Float = self.ray0 + rc[..., :1] * self.ray_row + rc[..., 1:] * self.ray_col
@@ -67,6 +72,16 @@ class RayGrid:
             self.origin + row * self.e_row + col * self.e_col, self.e_row, self.e_col,
             self.rays(np.asarray(rc_offset, float)), self.ray_row, self.ray_col,
             shift @ self.matrix, shape,
+        )  # fmt: skip
+
+    def coarser(self, block: int) -> RayGrid:
+        """Every place the middle of `block` by `block` of the places before."""
+        middle = self.moved(np.full(2, (block - 1) / 2), self.shape)
+        rows, cols = (-(-n // block) for n in self.shape)
+        scale = np.diag([1 / block, 1 / block, 1.0])
+        return RayGrid(
+            middle.origin, block * self.e_row, block * self.e_col, middle.ray0,
+            block * self.ray_row, block * self.ray_col, scale @ middle.matrix, (rows, cols),
         )  # fmt: skip
 
 

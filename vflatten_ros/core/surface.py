@@ -12,8 +12,9 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.arrays import as_points
 from vflatten_ros.core.breaks import Layers, connected_window, find_layers, near_measured
 from vflatten_ros.core.config import SurfaceConfig
+from vflatten_ros.core.depth_image import depth_image
 from vflatten_ros.core.errors import InvalidInput
-from vflatten_ros.core.raygrid import RayGrid, camera_rays, parallel_rays
+from vflatten_ros.core.raygrid import RayGrid
 from vflatten_ros.core.rulings import average_along_rulings
 from vflatten_ros.core.smoothing import (
     fill_holes,
@@ -86,10 +87,9 @@ def fit_surface(
     if len(points) < 6:
         raise InvalidInput(f"points: expected at least 6 to fit a surface, got {len(points)}")
     toward = np.broadcast_to(np.asarray(toward, float), points.shape)
-    rays, rc, organised = _place_on_grid(points, toward, pixel, shape)
-    image, seen = _depth_image(points, rays, rc, organised)
+    rays, rc, image, seen = depth_image(points, toward, pixel, shape, config.radius_m / 1.75)
     progress("surface", 0.2)
-    cell = _cell(rays, float(np.median(image[seen])))
+    cell = rays.spacing(float(np.median(image[seen])))
     width = max(config.radius_m / 1.75 / cell, 1.2)
     fits, gain = quadratic_image(image, seen, near_measured(seen), width)
     noise = 1.4826 * float(np.median(np.abs(image - fits[..., 0])[seen]))
@@ -182,75 +182,6 @@ def _linear_fits(
     out = fits.copy()
     out[layers.valid] = np.where(supported[:, None], planes, fits[layers.valid])
     return out
-
-
-def _depth_image(points: Float, rays: RayGrid, rc: Float, organised: bool) -> tuple[Float, Bool]:
-    depth = rays.to_grid(points)[1]
-    image, seen = np.zeros(rays.shape), np.zeros(rays.shape, bool)
-    at = tuple(np.round(rc).astype(int).T)
-    seen[at] = True
-    if organised:
-        image[at] = depth
-        return image, seen
-    rows, cols = np.nonzero(seen)
-    places = np.stack([rows, cols], axis=1).astype(float)
-    _, near = cKDTree(rc).query(places, 9)
-    image[rows, cols] = _plane_at(places, rc[near], depth[near])
-    return image, seen
-
-
-def _plane_at(places: Float, rc: Float, depth: Float) -> Float:
-    """(k,) depth at places from the (k, n) nearest measured ones on one layer, by planes."""
-    offset = rc - places[:, None]
-    spread = np.abs(depth - depth[:, :1])
-    typical = np.median(spread)
-    weight = np.exp(-0.5 * (offset**2).sum(axis=-1)) * (spread < 6 * typical + 1e-9) + 1e-9
-    basis = np.concatenate([np.ones((*depth.shape, 1)), offset], axis=-1)
-    scaled = basis * weight[..., None]
-    normal = np.matmul(scaled.swapaxes(1, 2), basis)
-    normal += weight.sum(axis=1)[:, None, None] * np.diag([0.0, 1e-2, 1e-2])
-    right = np.einsum("kni,kn->ki", scaled, depth - depth[:, :1])
-    solved: Float = np.linalg.solve(normal, right[..., None])[:, 0, 0]
-    return solved + depth[:, 0]
-
-
-def _cell(rays: RayGrid, depth: float) -> float:
-    """Metres across the rays from one grid line to the next."""
-    row, col = rays.e_row + depth * rays.ray_row, rays.e_col + depth * rays.ray_col
-    return float(np.sqrt(np.linalg.norm(row) * np.linalg.norm(col)))
-
-
-def _place_on_grid(
-    points: Float, toward: Float, pixel: NDArray[np.int32] | None, shape: tuple[int, int] | None
-) -> tuple[RayGrid, Float, bool]:
-    """Rays, the place of every point on their grid, and whether the points are at grid places."""
-    rays = None
-    if pixel is not None and shape is not None and np.ptp(pixel, axis=0).min() > 0:
-        rays = camera_rays(points, pixel, shape)
-    organised = rays is not None
-    if rays is None:
-        rays = _own_grid(points, toward)
-    place = rays.to_grid(points)[0]
-    if organised:
-        place = np.round(place)
-    low = np.floor(place.min(axis=0)) - 4
-    extent = np.ceil(place.max(axis=0)) - low + 5
-    return rays.moved(low, (int(extent[0]), int(extent[1]))), place - low, organised
-
-
-def _own_grid(points: Float, toward: Float) -> RayGrid:
-    """Parallel rays about as far apart as the points."""
-    view = toward.mean(axis=0)
-    view = view / np.linalg.norm(view)
-    e_row = np.cross(view, np.eye(3)[np.argmin(np.abs(view))])
-    e_row /= np.linalg.norm(e_row)
-    e_col = np.cross(view, e_row)
-    flat = np.stack([points @ e_row, points @ e_col], axis=1)
-    near, _ = cKDTree(flat).query(flat[:: max(1, len(flat) // 2000)], 5)
-    coarse = max(2.0 * float(np.median(near[:, 4])), 1e-6)
-    area = len(np.unique(np.floor(flat / coarse), axis=0)) * coarse**2
-    step = np.sqrt(area / len(points))
-    return parallel_rays(np.zeros(3), e_row * step, e_col * step, (1, 1))
 
 
 def depth_at(surface: Surface, rc: Float) -> tuple[Float, Float, Bool]:

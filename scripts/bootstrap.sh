@@ -64,7 +64,7 @@ make_venv() {
   check_tools
   check_python
   say "making .venv ($("$python" --version), $underlay); a minute or two"
-  rm -rf "$venv" build install log
+  rm -rf "$venv" build/vflatten_ros install
   "$python" -m venv "${venv_options[@]}" "$venv"
   install_locked
   "$prepare_venv"

@@ -299,6 +299,9 @@ class AssemblyConfig(Checked):
     touch_m: float = option(
         0.012, "Cloth this near as it hangs may touch, m.", low=0.001, high=0.1
     )
+    joined_m: float = option(
+        0.006, "Cloth this near as it hangs is joined there, m.", low=0.0005, high=0.1
+    )
     overlap_m: float = option(
         0.004, "Pieces may overlap by so much in the plane, m.", low=0.0, high=0.1
     )
@@ -427,7 +430,7 @@ class RotationConfig(Checked):
         0.15, "Nearer pairs on one sheet keep their distance both ways, m.", low=0.01, high=2.0
     )
     close_m: float = option(
-        0.008, "Gaps between flattened samples narrower than twice this are closed, m.", low=0.002, high=0.1
+        0.003, "Gaps between flattened samples narrower than twice this are closed, m.", low=0.002, high=0.1
     )
     edge_blur_m: float = option(
         0.004, "Blur of the flattened samples' density, m.", low=0.001, high=0.05
@@ -440,6 +443,21 @@ class RotationConfig(Checked):
     )
     high_stress_m: float = option(
         0.01, "Contradiction of distances above which the result says so, m.", low=1e-4, high=1.0
+    )
+    hidden_m: float = option(
+        0.01, "Layers nearer than this hide one another's edges, m.", low=0.001, high=0.1
+    )
+    certain: float = option(
+        0.9, "Certainty of the category below which another hypothesis is tried.", low=0.0, high=1.0
+    )
+    overlaid: float = option(
+        0.07, "Share of the surface lying on more of its side that asks for another hypothesis.", low=0.0, high=1.0
+    )
+    neck_m: float = option(
+        0.03, "Radius of a disc without which the surface round a false neck falls in two, m.", low=0.005, high=0.2
+    )
+    detour_m: float = option(
+        0.12, "Shortest way round a neck that may be false, m.", low=0.01, high=5.0
     )
     unfold_rounds: int = option(
         15, "Reweightings at each strength of spreading.", low=1, high=1000

@@ -41,11 +41,11 @@ class Distances:
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """Directed links, sorted, with the complex step that each makes in its start's tangent plane."""
+    """Directed links, sorted, with the step that each makes in its start's tangent plane."""
 
     key: Int  # (2m,) start * n + end
     step: NDArray[np.complex128]  # (2m,) length and direction in the frame of the start
-    turn: NDArray[np.complex128]  # (2m,) unit: takes directions in the frame of the end to that of the start
+    turn: NDArray[np.complex128]  # (2m,) unit: from the frame of the end to that of the start
     rim: Bool  # (2m,)
 
 
@@ -157,7 +157,7 @@ def _around(walk: _Walk, count: int) -> tuple[Int, Float, Bool]:
 
 def _landmarks(
     graph: csr_matrix, firm: Bool, config: RotationConfig
-) -> tuple[Int, Float, NDArray[np.int32]]:
+) -> tuple[Int, Float32, NDArray[np.int32]]:
     """Farthest-point landmarks, their distances to all samples near them, and the paths there."""
     limit = config.local_m
     most = min(config.landmarks, int(firm.sum()))
@@ -173,9 +173,7 @@ def _landmarks(
     return chosen, rows, before
 
 
-def _steps(
-    xyz: Float, normal: Float, a: Int, b: Int, length_m: Float, rim: Bool
-) -> _Steps:
+def _steps(xyz: Float, normal: Float, a: Int, b: Int, length_m: Float, rim: Bool) -> _Steps:
     start, end = np.r_[a, b], np.r_[b, a]
     order = np.argsort(start * len(xyz) + end)
     start, end = start[order], end[order]

@@ -7,7 +7,6 @@ fit settles: the other layer drops out instead of being averaged in.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,7 +123,7 @@ def _tangents(normal: Float) -> tuple[Float, Float]:
 
 def _thinned(xyz: Float, normal: Float, sigma: Float, apart_m: float) -> Bool:
     """Drop samples without support, and of two on one layer nearer than apart_m the vaguer one."""
-    keep = np.isfinite(xyz).all(1) & (sigma < 4 * sigma.min())
+    keep: Bool = np.isfinite(xyz).all(1) & (sigma < 4 * sigma.min())
     a, b = cKDTree(xyz).query_pairs(apart_m, output_type="ndarray").T
     same = (normal[a] * normal[b]).sum(1) > 0.7
     a, b = a[same], b[same]

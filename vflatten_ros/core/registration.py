@@ -51,7 +51,7 @@ def view_surface(view: View, config: RotationConfig) -> ViewSurface:
     points = transform_points(T_hanger_rig, view.points_rig)
     if len(points) < MIN_POINTS:
         raise NotEnoughViews(
-            f"view {view.view_id}: {len(points)} points on the item, expected {MIN_POINTS} or more; "
+            f"view {view.view_id}: {len(points)} points on the item, expected {MIN_POINTS}; "
             "leave the view out or widen segmentation.radius_m"
         )
     camera = T_hanger_rig[:3, 3]

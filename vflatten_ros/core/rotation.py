@@ -6,7 +6,7 @@ Like the pipeline, this module knows the order of its stages, which do not know 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,9 +18,10 @@ from vflatten_ros.core.distances import Distances, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.fusion import Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
+from vflatten_ros.core.necks import cut_necks
 from vflatten_ros.core.registration import ViewSurface, register_views, view_surface
-from vflatten_ros.core.sheets import Links, link_samples
-from vflatten_ros.core.unfolding import carry, orientation, place_samples, settle, unfold
+from vflatten_ros.core.sheets import Links, link_samples, sheet_edges
+from vflatten_ros.core.unfolding import carry, orientation, overlap, place_samples, settle, unfold
 from vflatten_ros.core.values import (
     Correspondence,
     FlatPoints,
@@ -33,6 +34,8 @@ from vflatten_ros.core.values import (
     no_progress,
 )
 
+HIDDEN_M = 0.012  # samples round a point of the outline that say whether it is an edge
+HIDDEN_SHARE = 0.75  # of the edges there that are hidden, above which it is no edge
 CELL_M = 0.002  # of the image whose contour is the outline
 
 
@@ -58,6 +61,7 @@ class Unfolded:
     outline: Outline
     start_uv: Float  # (n, 2)
     stress_m: float  # rms excess over the distances
+    overlap: float  # 0-1, share of the surface that lies on more of the same side
     notices: tuple[Notice, ...]
 
 
@@ -90,9 +94,30 @@ def unfold_views(
     return _unfolded(surface, plane, config)
 
 
-def turn_parts(
-    unfolded: Unfolded, swung: Float, rest: Float, config: RotationConfig
+def unfold_without_necks(
+    unfolded: Unfolded, config: RotationConfig, progress: Progress = no_progress
 ) -> Unfolded:
+    """Another hypothesis: the same views, with every narrow place cut that may be false.
+
+    Raises
+    ------
+    DisconnectedSurface
+    """
+    samples, links = unfolded.surface.samples, unfolded.surface.links
+    progress("necks", 0.0)
+    keep = cut_necks(
+        samples.xyz, samples.normal, links.a, links.b, links.length_m, links.rim, config
+    )
+    links = Links(links.a[keep], links.b[keep], links.length_m[keep], links.rim[keep])
+    distances = surface_distances(
+        samples.xyz, samples.normal, links.a, links.b, links.length_m, links.rim, config
+    )
+    plane = unfold(distances.bound_m, distances.same_sheet, config, progress)
+    surface = replace(unfolded.surface, links=links, distances=distances)
+    return _unfolded(surface, plane, config)
+
+
+def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationConfig) -> Unfolded:
     """The same surface with its loose parts (legs, sleeves) turned as a template says.
 
     Parameters
@@ -145,9 +170,7 @@ def whole_surface(
 
 def _unfolded(surface: Surface, plane: Float, config: RotationConfig) -> Unfolded:
     samples, links, distances = surface.samples, surface.links, surface.distances
-    uv, misfit = place_samples(
-        distances.around, distances.around_m, distances.around_sheet, plane
-    )
+    uv, misfit = place_samples(distances.around, distances.around_m, distances.around_sheet, plane)
     side = orientation(uv, samples.xyz, samples.normal, links.a, links.b)
     placed = np.isfinite(uv).all(1) & distances.inside
     points = FlatPoints(
@@ -164,14 +187,24 @@ def _unfolded(surface: Surface, plane: Float, config: RotationConfig) -> Unfolde
     if stress > config.high_stress_m:
         text = f"distances contradict each other by {1e3 * stress:.0f} mm"
         notices.append(Notice("high_stress", text))
-    outline = outline_of(points.uv, points.sigma_m, config)
-    return Unfolded(surface, plane, points, side[placed], outline, points.uv, stress, tuple(notices))
+    folded = overlap(plane, distances.bound_m, side[distances.chosen])
+    sheet = ~links.rim
+    edge = sheet_edges(samples.xyz, samples.normal, links.a[sheet], links.b[sheet], config)
+    outline = outline_of(points.uv, points.sigma_m, edge[placed], config)
+    return Unfolded(
+        surface, plane, points, side[placed], outline, points.uv, stress, folded, tuple(notices)
+    )
 
 
-def outline_of(uv: Float, sigma_m: Float, config: RotationConfig) -> Outline:
-    """Where the density of the samples falls to half of that of a single layer.
+def outline_of(uv: Float, sigma_m: Float, edge: Int, config: RotationConfig) -> Outline:
+    """Where the density of the samples falls to a share of that of a single layer.
 
     A contour round every sample would go round the strays too, and be too large for it.
+
+    Parameters
+    ----------
+    edge : ndarray of shape (n,)
+        0: inside a sheet, 1: at an edge of the cloth, 2: where cloth goes on unseen.
     """
     low = uv.min(0) - 10 * config.edge_blur_m
     size = np.ceil((uv.max(0) + 10 * config.edge_blur_m - low) / CELL_M).astype(int)
@@ -183,7 +216,7 @@ def outline_of(uv: Float, sigma_m: Float, config: RotationConfig) -> Outline:
     single = (CELL_M / config.spacing_m) ** 2  # samples of one layer in a cell
     density = cv2.GaussianBlur(count, (0, 0), config.edge_blur_m / CELL_M)
     inside = (density > config.edge_density * single).astype(np.uint8)
-    gap = int(round(config.close_m / CELL_M))
+    gap = round(config.close_m / CELL_M)
     inside = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, _disc(gap))
     contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -193,7 +226,16 @@ def outline_of(uv: Float, sigma_m: Float, config: RotationConfig) -> Outline:
     if _twice_area(contour) < 0:
         contour = contour[::-1]
     near = cKDTree(uv).query(contour)[1]
-    return Outline(contour, sigma_m[near], np.zeros(len(contour), dtype=bool))
+    inferred = _near(contour, uv[edge == 2]) > HIDDEN_SHARE * _near(contour, uv[edge > 0])
+    return Outline(contour, sigma_m[near], inferred)
+
+
+def _near(contour: Float, uv: Float) -> Int:
+    """How many points lie round each point of the outline."""
+    if not len(uv):
+        return np.zeros(len(contour), dtype=np.int64)
+    count: Int = cKDTree(uv).query_ball_point(contour, HIDDEN_M, return_length=True)
+    return count
 
 
 def _disc(radius: int) -> NDArray[np.uint8]:
@@ -205,7 +247,8 @@ def _disc(radius: int) -> NDArray[np.uint8]:
 
 def _smoothed(contour: Float, reach: int = 2) -> Float:
     shifted = [np.roll(contour, k, axis=0) for k in range(-reach, reach + 1)]
-    return np.mean(shifted, axis=0)[::2]
+    smooth: Float = np.mean(shifted, axis=0)[::2]
+    return smooth
 
 
 def _twice_area(contour: Float) -> float:

@@ -55,10 +55,35 @@ def link_samples(xyz: Float, normal: Float, config: RotationConfig) -> Links:
     return Links(a[keep], b[keep], along[keep], rim[keep])
 
 
+def sheet_edges(xyz: Float, normal: Float, a: Int, b: Int, config: RotationConfig) -> Int:
+    """Samples at the edge of what was seen of their sheet.
+
+    Returns
+    -------
+    ndarray of shape (n,)
+        0: not at an edge; 1: at an edge of the cloth or a fold; 2: another sheet lies close by in
+        front of the sample's tangent plane, so that the cloth probably goes on beneath it.
+    """
+    n = len(xyz)
+    one, other = cKDTree(xyz).query_pairs(config.hidden_m, output_type="ndarray").T
+    ones = np.ones(2 * len(a), dtype=np.float32)
+    adjacent = csr_matrix((ones, (np.r_[a, b], np.r_[b, a])), shape=(n, n))
+    two = adjacent @ adjacent + adjacent
+    near = np.asarray(two[one, other]).ravel() > 0
+    one, other = one[~near], other[~near]
+    chord = xyz[other] - xyz[one]
+    hidden = np.zeros(n, dtype=bool)
+    hidden[one[(chord * normal[one]).sum(1) > config.step_m]] = True
+    hidden[other[-(chord * normal[other]).sum(1) > config.step_m]] = True
+    edge: Int = _at_edge(a, b, xyz, normal) * np.where(hidden, 2, 1)
+    return edge
+
+
 def _arc(chord: Float, alike: Float) -> Float:
-    """Length of the circular arc over each chord, from the cosine of the angle between its normals."""
+    """Length of the circular arc over each chord, from the cosine between its normals."""
     half = np.arccos(alike.clip(0.3, 1.0)) / 2
-    return chord * np.where(half > 1e-3, half / np.maximum(np.sin(half), 1e-3), 1.0)
+    arc: Float = chord * np.where(half > 1e-3, half / np.maximum(np.sin(half), 1e-3), 1.0)
+    return arc
 
 
 def _supported(a: Int, b: Int, sheet: Bool, n: int, config: RotationConfig) -> Bool:
@@ -98,4 +123,5 @@ def _at_edge(a: Int, b: Int, xyz: Float, normal: Float) -> Bool:
     following[last[some]] = angle[first[some]] + 2 * np.pi
     gap = np.full(n, 2 * np.pi)
     gap[some] = np.maximum.reduceat(following - angle, first[some])
-    return gap > RIM_GAP_RAD
+    wide: Bool = gap > RIM_GAP_RAD
+    return wide

@@ -14,6 +14,8 @@ from scipy.linalg import cho_factor, cho_solve
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
+UPON_M = 0.015  # landmarks this near in the plane lie on one another ...
+UPON_FAR_M = 0.08  # ... if they are this far apart along the cloth
 STAY = 1e-6  # weight of the present distance of every pair: keeps the equations regular
 SPREAD = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # weight of distances that fall short, in turn
 
@@ -45,9 +47,21 @@ def unfold(
 
 def settle(plane: Float, bound: Float, near: Bool, config: RotationConfig) -> Float:
     """Keep bounds and near distances, from where the points are, without spreading any more."""
+    centre = plane.mean(0)
     for _ in range(config.unfold_rounds):
         plane = _majorise(plane, bound, near, 0.0)
-    return plane
+    settled: Float = plane + centre
+    return settled
+
+
+def overlap(plane: Float, bound: Float, up: Float) -> float:
+    """Share of landmarks on which others of the same side lie, from far along the cloth.
+
+    A garment laid flat has one layer of either side everywhere. More mean that layers were
+    joined that are not.
+    """
+    upon = (_pairwise(plane) < UPON_M) & (bound > UPON_FAR_M) & (np.outer(up, up) > 0)
+    return float(upon.any(1).mean())
 
 
 def carry(points: Float, before: Float, after: Float) -> Float:
@@ -71,7 +85,8 @@ def carry(points: Float, before: Float, after: Float) -> Float:
     turn = (weight * p.conj() * q).sum(1)
     turn /= np.maximum(np.abs(turn), 1e-12)
     moved = turn * ((points - from_) @ np.array([1, 1j]))
-    return to + np.column_stack([moved.real, moved.imag])
+    carried: Float = to + np.column_stack([moved.real, moved.imag])
+    return carried
 
 
 def _along(outline: Float, per_edge: int = 20) -> Float:
@@ -102,15 +117,14 @@ def _majorise(plane: Float, bound: Float, near: Bool, spread: float) -> Float:
 
 def _pairwise(plane: Float) -> Float:
     x, y = plane.T
-    return np.sqrt((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2)
+    apart: Float = np.sqrt((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2)
+    return apart
 
 
 def _classical_scaling(bound: Float) -> Float:
     """Torgerson 1952; signs fixed by the largest coordinate, or results flip between machines."""
     squared = bound**2
-    gram = -0.5 * (
-        squared - squared.mean(0) - squared.mean(1)[:, None] + squared.mean()
-    )
+    gram = -0.5 * (squared - squared.mean(0) - squared.mean(1)[:, None] + squared.mean())
     values, axes = np.linalg.eigh(gram)
     axes = axes[:, -2:]
     axes = axes * np.sign(axes[np.abs(axes).argmax(0), [0, 1]])
@@ -118,9 +132,7 @@ def _classical_scaling(bound: Float) -> Float:
     return plane
 
 
-def place_samples(
-    around: Int, around_m: Float, sheet: Bool, plane: Float
-) -> tuple[Float, Float]:
+def place_samples(around: Int, around_m: Float, sheet: Bool, plane: Float) -> tuple[Float, Float]:
     """Every sample's place from its distances to the landmarks around it.
 
     Parameters
@@ -164,9 +176,7 @@ def place_samples(
     return uv, misfit
 
 
-def orientation(
-    uv: Float, xyz: Float, normal: Float, a: Int, b: Int
-) -> Float:
+def orientation(uv: Float, xyz: Float, normal: Float, a: Int, b: Int) -> Float:
     """Which way up each sample lies: 1 with its outside up, -1 with its outside down, 0 unclear.
 
     From the links (a, b) around a sample: whether their directions turn the same way in the plane

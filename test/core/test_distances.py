@@ -1,0 +1,58 @@
+"""Distances along linked samples, on surfaces whose distances are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.distances import surface_distances
+from vflatten_ros.core.errors import DisconnectedSurface
+from vflatten_ros.core.sheets import link_samples
+
+CONFIG = RotationConfig(landmarks=60)
+
+
+def rolled(radius_m: float, width_m: float = 0.2, height_m: float = 0.2, seed: int = 3):
+    """Samples, normals and flat places of a sheet rolled round a cylinder, unevenly spread."""
+    rng = np.random.default_rng(seed)
+    grid = np.mgrid[0:width_m:0.004, 0:height_m:0.004].reshape(2, -1).T
+    flat = grid + rng.uniform(-0.001, 0.001, grid.shape)
+    angle = flat[:, 0] / radius_m
+    normal = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+    xyz = radius_m * normal + flat[:, 1:] * [0.0, 0.0, 1.0]
+    return xyz, normal, flat
+
+
+def measured(xyz, normal, config=CONFIG):
+    links = link_samples(xyz, normal, config)
+    return surface_distances(xyz, normal, links.a, links.b, links.length_m, links.rim, config)
+
+
+@pytest.mark.parametrize("radius_m", [0.05, 0.1, 10.0])
+def test_straightened_paths_have_the_length_of_the_unrolled_sheet(radius_m):
+    xyz, normal, flat = rolled(radius_m)
+    found = measured(xyz, normal)
+    at = flat[found.chosen]
+    true = np.linalg.norm(at[:, None] - at[None], axis=2)
+    near = found.same_sheet & (true > 0.03)
+    ratio = found.bound_m[near] / true[near]
+    assert near.sum() > 200
+    assert abs(np.median(ratio) - 1) < 0.003  # paths over links alone are 3-4 % long
+    assert np.quantile(np.abs(ratio - 1), 0.95) < 0.015
+
+
+def test_far_distances_over_landmarks_are_hardly_too_long():
+    xyz, normal, flat = rolled(10.0, width_m=0.4)
+    found = measured(xyz, normal, RotationConfig(landmarks=150))
+    at = flat[found.chosen]
+    true = np.linalg.norm(at[:, None] - at[None], axis=2)
+    ratio = found.bound_m[true > 0.25] / true[true > 0.25]
+    assert 0.995 < np.median(ratio) < 1.01
+
+
+def test_two_sheets_far_apart_raise():
+    xyz, normal, _ = rolled(10.0, width_m=0.1)
+    twice = np.vstack([xyz + np.array([x, 0.0, 0.0]) for x in (0.0, 1.0, 2.0)])
+    with pytest.raises(DisconnectedSurface, match="pieces"):
+        measured(twice, np.vstack([normal] * 3))

@@ -1,0 +1,100 @@
+"""Views of a known body that sways and lags: the corrections must undo it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.errors import NotEnoughViews
+from vflatten_ros.core.geometry import inverse, rotation_about, transform_points
+from vflatten_ros.core.registration import register_views, view_surface
+from vflatten_ros.core.values import Calibration, View
+
+CALIBRATION = Calibration(
+    "rig", (0.0, -0.4, 1.3), (0.0, -1.0, 0.0), (0.0, -0.4, 1.3), "wrist", 1.0, 0.0
+)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def body():
+    """A crumpled column round the axis in the hanger frame: points and outward normals."""
+    height, angle = np.mgrid[-0.5:-0.05:0.004, 0 : 2 * np.pi : 0.05]
+    height, angle = height.ravel(), angle.ravel()
+    radius = 0.08 + 0.02 * np.cos(3 * angle + 8 * height) + 0.01 * np.sin(25 * height)
+    xyz = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
+    return xyz, np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+
+
+def views_of(motions, noise_m=0.0, calibration=CALIBRATION, assumed=CALIBRATION):
+    """Views at even angles of the body, moved before it turns by (shift_m, lag_rad)."""
+    xyz, normal = body()
+    views, rng = [], np.random.default_rng(7)
+    for k, (shift, lag) in enumerate(motions):
+        angle = 2 * np.pi * k / len(motions)
+        turn = rotation_about(UP, lag)
+        T = calibration.T_rig_hanger(angle)
+        moved = transform_points(T, xyz @ turn.T + shift)
+        facing = ((normal @ turn.T @ T[:3, :3].T) * -moved).sum(1) > 0.3 * np.linalg.norm(
+            moved, axis=1
+        )
+        points = moved[facing] + rng.normal(0, noise_m, (int(facing.sum()), 3))
+        pixel = np.zeros((len(points), 2), dtype=np.int32)
+        views.append(View(k, k, angle, points, pixel, None, (480, 360), assumed))
+    return views
+
+
+def places(poses, motions):
+    """Where each view puts every point of the body, (views, n, 3), centred over the views."""
+    xyz = body()[0][::50]
+    at = [
+        transform_points(pose, xyz @ rotation_about(UP, lag).T + shift)
+        for pose, (shift, lag) in zip(poses, motions, strict=True)
+    ]
+    return np.array(at) - np.mean(at, axis=0)
+
+
+def test_sway_and_lag_are_undone():
+    rng = np.random.default_rng(3)
+    motions = [(rng.normal(0, 0.002, 3), np.radians(rng.normal(0, 0.3))) for _ in range(16)]
+    views = views_of(motions, noise_m=0.0005)
+    config = RotationConfig()
+    surfaces = [view_surface(v, config) for v in views]
+    before = places([np.eye(4)] * 16, motions)
+    after = places(register_views(surfaces, config), motions)
+    rms = [float(np.sqrt((p**2).sum(2).mean())) for p in (before, after)]
+    assert rms[0] > 0.003
+    assert rms[1] < 0.0006  # a fifth of the sway; the noise is half a millimetre
+
+
+def test_a_shifted_axis_is_found_from_all_views():
+    true = Calibration(
+        "rig", (0.003, -0.4, 1.302), (0.0, -1.0, 0.0), (0.003, -0.4, 1.302), "wrist", 1.0, 0.0
+    )
+    motions = [(np.zeros(3), 0.0)] * 16
+    views = views_of(motions, calibration=true)
+    surfaces = [view_surface(v, RotationConfig()) for v in views]
+    poses = register_views(surfaces, RotationConfig())
+    xyz = body()[0][::50]
+    raw, fixed = [], []
+    for view, pose in zip(views, poses, strict=True):
+        T = inverse(CALIBRATION.T_rig_hanger(view.angle_rad)) @ true.T_rig_hanger(view.angle_rad)
+        raw.append(transform_points(T, xyz))
+        fixed.append(transform_points(pose, raw[-1]))
+    assert np.linalg.norm(raw - np.mean(raw, axis=0), axis=2).mean() > 0.003
+    assert np.linalg.norm(fixed - np.mean(fixed, axis=0), axis=2).mean() < 0.0006
+
+
+def test_normals_point_to_the_camera():
+    view = views_of([(np.zeros(3), 0.0)])[0]
+    surface = view_surface(view, RotationConfig())
+    assert (((surface.camera - surface.points) * surface.normals).sum(1) > 0).all()
+
+
+def test_one_view_and_an_empty_one_raise():
+    views = views_of([(np.zeros(3), 0.0)])
+    with pytest.raises(NotEnoughViews, match="2 or more"):
+        register_views([view_surface(views[0], RotationConfig())], RotationConfig())
+    none = View(0, 0, 0.0, np.zeros((0, 3)), np.zeros((0, 2), np.int32), None, (4, 4), CALIBRATION)
+    with pytest.raises(NotEnoughViews, match="0 points"):
+        view_surface(none, RotationConfig())

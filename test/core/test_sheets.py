@@ -1,0 +1,85 @@
+"""Links between samples of sheets, layers and folds that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.necks import cut_necks
+from vflatten_ros.core.sheets import link_samples, sheet_edges
+
+CONFIG = RotationConfig()
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def sheet(x0, x1, y0, y1, z=0.0, seed=1):
+    """Samples about 4 mm apart of a level sheet."""
+    rng = np.random.default_rng(seed)
+    grid = np.mgrid[x0:x1:0.004, y0:y1:0.004].reshape(2, -1).T
+    flat = grid + rng.uniform(-0.0004, 0.0004, grid.shape)
+    return np.column_stack([flat, np.full(len(flat), z)])
+
+
+def between(links, of, one, other):
+    return int(((of[links.a] == one) & (of[links.b] == other)).sum())
+
+
+def test_an_even_sheet_is_linked_throughout():
+    xyz = sheet(0, 0.1, 0, 0.1)
+    links = link_samples(xyz, np.tile(UP, (len(xyz), 1)), CONFIG)
+    degree = np.bincount(np.r_[links.a, links.b])
+    assert degree.min() >= 3
+    assert not links.rim.any()
+
+
+def test_the_edge_of_a_layer_lying_on_another_is_not_bridged():
+    below, above = sheet(0, 0.06, 0, 0.1), sheet(0.06, 0.12, 0, 0.1, z=0.003, seed=2)
+    xyz = np.vstack([below, above])
+    layer = np.repeat([0, 1], [len(below), len(above)])
+    links = link_samples(xyz, np.tile(UP, (len(xyz), 1)), CONFIG)
+    assert between(links, layer, 0, 1) == 0
+    edge = sheet_edges(xyz, np.tile(UP, (len(xyz), 1)), links.a, links.b, CONFIG)
+    assert (edge[(layer == 0) & (xyz[:, 0] > 0.055)] == 2).mean() > 0.5  # it goes on below
+    assert (edge[layer == 1] != 2).all()
+
+
+def test_the_two_sides_of_a_fold_are_linked_round_its_rim_only():
+    front, back = sheet(0, 0.06, 0, 0.1), sheet(0, 0.06, 0, 0.1, z=-0.003, seed=2)
+    xyz = np.vstack([front, back])
+    side = np.repeat([0, 1], [len(front), len(back)])
+    normal = np.where(side[:, None] == 0, UP, -UP)
+    links = link_samples(xyz, normal, CONFIG)
+    across = side[links.a] != side[links.b]
+    assert across.sum() > 20
+    assert links.rim[across].all()
+    inner = (np.abs(xyz - [0.03, 0.05, 0.0]) < [0.02, 0.04, 1.0]).all(1)
+    assert (inner[links.a] & inner[links.b] & across).sum() < 0.1 * across.sum()
+
+
+def test_layers_that_face_each_other_are_not_linked():
+    below, above = sheet(0, 0.06, 0, 0.1), sheet(0, 0.06, 0, 0.1, z=0.004, seed=2)
+    xyz = np.vstack([below, above])
+    layer = np.repeat([0, 1], [len(below), len(above)])
+    links = link_samples(xyz, np.where(layer[:, None] == 0, UP, -UP), CONFIG)
+    assert between(links, layer, 0, 1) == 0
+
+
+def test_a_short_contact_with_a_long_way_round_is_cut():
+    """A strip bent to a ring, whose ends touch over 2 cm: the contact is a neck."""
+    rng = np.random.default_rng(5)
+    grid = np.mgrid[0:0.62:0.004, 0:0.1:0.004].reshape(2, -1).T
+    flat = grid + rng.uniform(-0.0007, 0.0007, grid.shape)
+    angle = 2 * np.pi * flat[:, 0] / 0.62
+    notch = (flat[:, 0] > 0.612) & (
+        np.abs(flat[:, 1] - 0.05) > 0.01
+    )  # the ends touch in the middle
+    notch |= (flat[:, 0] < 0.008) & (np.abs(flat[:, 1] - 0.05) > 0.01)
+    flat, angle = flat[~notch], angle[~notch]
+    normal = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+    xyz = 0.62 / (2 * np.pi) * normal + flat[:, 1:] * UP
+    links = link_samples(xyz, normal, CONFIG)
+    contact = np.abs(flat[links.a, 0] - flat[links.b, 0]) > 0.3
+    assert contact.sum() > 5
+    keep = cut_necks(xyz, normal, links.a, links.b, links.length_m, links.rim, CONFIG)
+    assert not keep[contact].any() or (~keep).sum() > 5
+    assert keep[~contact].mean() > 0.98

@@ -1,0 +1,93 @@
+"""Distances to plane: sheets, tubes and parts whose flat shape is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.unfolding import carry, orientation, place_samples, settle, unfold
+
+CONFIG = RotationConfig(unfold_rounds=8)
+
+
+def aligned(points, true):
+    """Points moved rigidly, mirror images allowed, onto the truth."""
+    a, b = points - points.mean(0), true - true.mean(0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    return a @ u @ vt + true.mean(0)
+
+
+def plane_of(count, width, height, seed=0):
+    return np.random.default_rng(seed).uniform(0, 1, (count, 2)) * [width, height]
+
+
+def test_a_sheet_comes_out_as_it_is():
+    true = plane_of(120, 0.3, 0.5)
+    bound = np.linalg.norm(true[:, None] - true[None], axis=2)
+    found = aligned(unfold(bound, bound < 0.15, CONFIG), true)
+    assert np.abs(found - true).max() < 1e-4
+
+
+def test_a_tube_creases_to_half_its_girth():
+    girth, height = 0.3, 0.4
+    at = plane_of(300, girth, height, seed=4)
+    along = np.abs(at[:, None, 0] - at[None, :, 0])
+    bound = np.hypot(np.minimum(along, girth - along), at[:, None, 1] - at[None, :, 1])
+    plane = unfold(bound, bound < 0.08, CONFIG)
+    extent = np.ptp(aligned(plane, np.c_[np.zeros(300), at[:, 1]]), axis=0)
+    assert extent[0] == pytest.approx(girth / 2, rel=0.08)
+    assert extent[1] == pytest.approx(np.ptp(at[:, 1]), rel=0.03)
+
+
+def test_some_wrong_bounds_that_are_too_long_do_no_harm():
+    true = plane_of(150, 0.3, 0.4)
+    bound = np.linalg.norm(true[:, None] - true[None], axis=2)
+    far = np.triu(np.random.default_rng(1).random(bound.shape) < 0.1, 1) & (bound > 0.15)
+    loose = np.where(far | far.T, bound * 1.5, bound)
+    found = aligned(unfold(loose, bound < 0.15, CONFIG), true)
+    assert np.median(np.linalg.norm(found - true, axis=1)) < 0.003
+
+
+def test_settling_keeps_what_is_right():
+    true = plane_of(80, 0.3, 0.4)
+    bound = np.linalg.norm(true[:, None] - true[None], axis=2)
+    assert np.abs(settle(true, bound, bound < 0.15, CONFIG) - true).max() < 1e-4
+
+
+def test_samples_are_placed_by_their_distances():
+    rng = np.random.default_rng(2)
+    marks, true = plane_of(60, 0.3, 0.3), plane_of(200, 0.26, 0.26, seed=3) + 0.02
+    distance = np.linalg.norm(true[:, None] - marks[None], axis=2)
+    around = np.argsort(distance, axis=1)[:, :10]
+    near = np.take_along_axis(distance, around, 1) + rng.normal(0, 0.0005, around.shape)
+    uv, misfit = place_samples(around, near, np.ones_like(near, dtype=bool), marks)
+    assert np.quantile(np.linalg.norm(uv - true, axis=1), 0.9) < 0.002
+    assert np.median(misfit) < 0.001
+    blind = np.full_like(near, np.inf)
+    uv, misfit = place_samples(around, blind, np.ones_like(near, dtype=bool), marks)
+    assert np.isnan(uv).all() and np.isinf(misfit).all()
+
+
+def test_a_mirrored_part_lies_with_its_outside_down():
+    flat = np.mgrid[0:0.1:0.005, 0:0.1:0.005].reshape(2, -1).T
+    xyz, normal = np.c_[flat, np.zeros(len(flat))], np.tile([0.0, 0.0, 1.0], (len(flat), 1))
+    apart = np.linalg.norm(flat[:, None] - flat[None], axis=2)
+    a, b = np.nonzero(np.triu(apart < 0.008, 1))
+    assert (orientation(flat, xyz, normal, a, b) == 1).all()
+    assert (orientation(flat * [-1, 1], xyz, normal, a, b) == -1).all()
+
+
+def test_points_follow_the_part_of_the_outline_that_turns():
+    """An L whose long arm turns by 40 degrees about the corner."""
+    outline = np.array([[0, 0], [0.1, 0], [0.1, -0.5], [0.2, -0.5], [0.2, 0.1], [0, 0.1]])
+    angle = np.radians(40)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    arm = [2, 3]
+    moved = outline.copy()
+    moved[arm] = (outline[arm] - outline[1]) @ turn.T + outline[1]
+    points = np.array([[0.15, -0.45], [0.05, 0.05]])
+    found = carry(points, outline, moved)
+    expected = (points[0] - outline[1]) @ turn.T + outline[1]
+    assert np.linalg.norm(found[0] - expected) < 0.01
+    assert np.linalg.norm(found[1] - points[1]) < 0.01

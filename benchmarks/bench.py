@@ -112,7 +112,7 @@ def view_jobs(recording: Path) -> Iterator[Job]:
     calibration = load_calibration(calibration_beside(recording))
     templates = load_templates()
     views = gather_views(open_recording(recording), calibration, config).views()
-    for count in (6, 12, 24, 50, 100):
+    for count in (12, 24, 50, 100):
         if count > len(views):
             return
         pick = [views[int(i)] for i in np.linspace(0, len(views), count, endpoint=False)]

@@ -203,7 +203,7 @@ def _describe(surface: Surface, path: Float, held: Bool, converged: Bool) -> Geo
     coarse = np.linalg.norm(np.diff(points[:, ::2], axis=1), axis=2)
     # chords are short by a multiple of their squared length: extrapolate (Richardson 1911)
     length = (4 * segment.sum(axis=1) - coarse.sum(axis=1)) / 3
-    sigma = np.hypot(_end_sigma(surface, dense, points), 5e-4 * length)
+    sigma = np.hypot(_end_sigma(surface, dense, points), 1e-3 * length)
     apart = np.linalg.norm(points[:, -1] - points[:, 0], axis=1)
     gap, bridge, jumps = _gaps(surface, dense, points, segment)
     broken = gap > 0
@@ -216,7 +216,7 @@ def _describe(surface: Surface, path: Float, held: Bool, converged: Bool) -> Geo
         [broken & jumps, broken, bent, ~converged],
         # cloth behind a jump may be much longer than the way across; a hole is likely smooth;
         # a flat distance lies between the distance in space and the length round the border
-        [0.5 * bridge + 0.05 * length, 0.2 * bridge, 0.6 * (length - apart), 0.01 * length],
+        [0.5 * bridge + 0.05 * length, 0.2 * bridge, 0.6 * (length - apart), 0.6 * (length - apart)],
         0.0,
     )
     return Geodesics(points[:, ::FINE], length, np.hypot(sigma, doubt), reason != OK, reason)

@@ -216,7 +216,12 @@ def _describe(surface: Surface, path: Float, held: Bool, converged: Bool) -> Geo
         [broken & jumps, broken, bent, ~converged],
         # cloth behind a jump may be much longer than the way across; a hole is likely smooth;
         # a flat distance lies between the distance in space and the length round the border
-        [0.5 * bridge + 0.05 * length, 0.2 * bridge, 0.6 * (length - apart), 0.6 * (length - apart)],
+        [
+            0.5 * bridge + 0.05 * length,
+            0.3 * bridge + 0.01 * length,
+            0.6 * (length - apart),
+            0.6 * (length - apart),
+        ],
         0.0,
     )
     return Geodesics(points[:, ::FINE], length, np.hypot(sigma, doubt), reason != OK, reason)

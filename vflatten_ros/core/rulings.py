@@ -17,9 +17,9 @@ from vflatten_ros.core.geometry import Float
 from vflatten_ros.core.smoothing import slope_at, value_at
 from vflatten_ros.core.values import Bool, Int
 
-WINDOWS_M = (0.006, 0.012, 0.024, 0.040)  # standard deviations of the weight along a ruling
-STEP_M = 0.006
-REACH = 12  # samples to each side
+WINDOWS_M = (0.006, 0.012, 0.024, 0.045, 0.08)  # standard deviations of the weight along a ruling
+STEP_M = 0.008
+REACH = 16  # samples to each side
 DIRECTION_M = 0.015  # the direction is averaged over so much, standard deviation
 AGREE_M = 0.02  # windows are judged over so much, standard deviation
 CHUNK = 4000

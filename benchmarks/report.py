@@ -75,9 +75,10 @@ def machine() -> str:
 INTRO = """# Benchmarks beside other libraries
 
 Written by `make bench-peers`. Surfaces are developable, so the exact distance is that of their
-unrolling. They are seen on a 2.5 mm grid with noise along the view, independent from pixel to pixel
-unless said otherwise, and turned in the image. Errors of lines are median / 95th percentile / median
-signed error in per cent, over pairs of 5 to 40 cm. All other libraries get the points after a
-quadratic fit with a Gaussian weight of 7.5 mm ("smooth +"), which they do not bring. Ratios of errors
-are ratios of means over surfaces and over 1 and 2 mm of noise. Times are CPU seconds of one thread.
+unrolling. They are seen on a 2.5 mm grid with noise along the view, independent from pixel to
+pixel unless said otherwise, and turned in the image. Errors of lines are median / 95th percentile /
+median signed error in per cent, over pairs of 5 to 40 cm. Other libraries get the points after a
+quadratic fit with a Gaussian weight of 7.5 mm ("smooth +"), which they do not bring. Ratios of
+errors are ratios of means over surfaces and over 1 and 2 mm of noise. Times are CPU seconds of one
+thread.
 """

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, uniform_filter1d
+from scipy.ndimage import distance_transform_edt, uniform_filter, uniform_filter1d
 from scipy.ndimage import label as connected_regions
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -40,7 +40,9 @@ def near_measured(seen: Bool) -> Bool:
     return np.asarray((distance_transform_edt(~seen) <= RING) | small)
 
 
-def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m: float) -> Layers:
+def find_layers(
+    depth: Float, seen: Bool, points: Float, cell_m: float, noise_m: float, misfit: Float
+) -> Layers:
     """Join grid neighbours that no depth jump separates.
 
     Parameters
@@ -55,7 +57,10 @@ def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m:
         Distance of grid lines across the rays.
     noise_m : float
         Standard deviation of depth.
+    misfit : ndarray of shape (rows, cols)
+        Distance of the measured points from a smooth surface, which a jump contradicts.
     """
+    rough = _rough(misfit, seen, max(noise_m, 0.15 * cell_m))
     away, nearest = distance_transform_edt(~seen, return_indices=True)
     source = nearest[0] * seen.shape[1] + nearest[1]
     holes, _ = connected_regions(~seen)
@@ -66,7 +71,7 @@ def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m:
     reach = np.where(small, 8.0, 3.0)
     smooth, joined = [], []
     for axis in (1, 0):
-        near, close = _joined(depth, seen, points, source, reach, axis, cell_m, noise_m)
+        near, close = _joined(depth, seen, points, source, reach, rough, axis, cell_m, noise_m)
         near &= valid & np.roll(valid, -1, axis=axis)
         near[(slice(None), -1) if axis else -1] = False
         smooth.append(near)
@@ -77,7 +82,7 @@ def find_layers(depth: Float, seen: Bool, points: Float, cell_m: float, noise_m:
 
 
 def _joined(
-    depth: Float, seen: Bool, points: Float, source: Int, reach: Float, axis: int,
+    depth: Float, seen: Bool, points: Float, source: Int, reach: Float, rough: Bool, axis: int,
     cell_m: float, noise_m: float,
 ) -> tuple[Bool, Bool]:  # fmt: skip
     """Whether each place and the next along the axis are on one surface, and measured near by."""
@@ -91,6 +96,9 @@ def _joined(
     both = seen & np.roll(seen, -1, axis=axis)
     # steeper places cannot be told from a jump where nothing was measured between
     near = gap < np.hypot(np.where(both, 6.0, 2.5) * cell_m * steps, 5.0 * noise_m)
+    # nor where no smooth surface fits
+    doubtful = rough | np.roll(rough, -1, axis=axis)
+    near &= ~doubtful | (gap < np.hypot(1.6 * cell_m * steps, 3.5 * noise_m))
     close = steps <= np.maximum(reach, np.roll(reach, -1, axis=axis))
     limit = max(4.0 * noise_m, 1.2 * cell_m)
     low = max(3.2 * noise_m, 1.2 * cell_m)
@@ -98,6 +106,13 @@ def _joined(
     short, wide = (_step(depth, seen, axis, across) for across in (3, 7))
     step = (short > limit) & (wide > limit / 2) | (wide > low)
     return np.asarray(near & ~step), np.asarray(close)
+
+
+def _rough(misfit: Float, seen: Bool, noise_m: float) -> Bool:
+    """Places around which the misfit is more than 2.5 times the noise."""
+    squared = uniform_filter(np.where(seen, misfit**2, 0.0), 3, mode="constant")
+    mass = uniform_filter(seen.astype(float), 3, mode="constant")
+    return np.asarray(squared > (2.5 * noise_m) ** 2 * mass)
 
 
 def _step(depth: Float, seen: Bool, axis: int, across: int) -> Float:

@@ -95,7 +95,9 @@ def fit_surface(
     noise = 1.4826 * float(np.median(np.abs(image - fits[..., 0])[seen]))
     places = np.moveaxis(np.indices(seen.shape), 0, -1).astype(float)
     measured = rays.to_points(places, image)
-    layers = find_layers(image, seen, measured, cell, noise)
+    steepness = np.sqrt(1 + (fits[..., 1] ** 2 + fits[..., 2] ** 2) / cell**2)
+    misfit = (image - fits[..., 0]) / steepness
+    layers = find_layers(image, seen, measured, cell, noise, misfit)
     progress("surface", 0.5)
     special = _special(layers, fits, cell, int(np.ceil(2 * width)))
     if config.fit == "linear":

@@ -56,12 +56,12 @@ def test_without_noise_only_the_fit_of_the_folds_remains():
     assert np.abs(percent(lines_of(patch, pairs, 0.0), pairs[2])).max() < 0.1
 
 
-def test_the_standard_deviation_is_that_of_the_errors():
+def test_the_standard_deviation_covers_the_errors():
     patch = synthetic.curtain(0.020)
     pairs = patch.pairs(200)
     lines = lines_of(patch, pairs, 0.001)
     ratio = np.std((lines.length_m - pairs[2]) / lines.sigma_m)
-    assert 0.4 < ratio < 1.6
+    assert 0.2 < ratio < 1.3  # 0.1 % of the length is for cloth that is not ideal, as this is
 
 
 def test_paper_springs_find_the_line_of_figure_2():

@@ -424,7 +424,7 @@ class RotationConfig(Checked):
         0.001, "Deepest groove that a link round a rim may cross, m.", low=0.0, high=0.02
     )
     landmarks: int = option(
-        400, "Samples whose mutual distances are unfolded.", low=50, high=5000
+        300, "Samples whose mutual distances are unfolded.", low=50, high=5000
     )
     local_m: float = option(
         0.15, "Nearer pairs on one sheet keep their distance both ways, m.", low=0.01, high=2.0
@@ -436,7 +436,7 @@ class RotationConfig(Checked):
         0.004, "Blur of the flattened samples' density, m.", low=0.001, high=0.05
     )
     edge_density: float = option(
-        0.4, "Share of one layer's density at the outline.", low=0.05, high=1.0
+        0.6, "Share of one layer's density at the outline.", low=0.05, high=1.0
     )
     uv_sigma_m: float = option(
         0.004, "Least standard deviation of a flattened point, m.", low=1e-4, high=0.1
@@ -453,6 +453,9 @@ class RotationConfig(Checked):
     overlaid: float = option(
         0.07, "Share of the surface lying on more of its side that asks for another hypothesis.", low=0.0, high=1.0
     )
+    untrusted_overlap: float = option(
+        0.1, "Share of the surface lying on more of its side above which the result says so.", low=0.0, high=1.0
+    )
     neck_m: float = option(
         0.03, "Radius of a disc without which the surface round a false neck falls in two, m.", low=0.005, high=0.2
     )
@@ -460,7 +463,7 @@ class RotationConfig(Checked):
         0.12, "Shortest way round a neck that may be false, m.", low=0.01, high=5.0
     )
     unfold_rounds: int = option(
-        15, "Reweightings at each strength of spreading.", low=1, high=1000
+        10, "Reweightings at each strength of spreading.", low=1, high=1000
     )
 
 

@@ -34,6 +34,8 @@ from vflatten_ros.core.values import (
     no_progress,
 )
 
+FIRM = 3  # distances along the sheet that place a sample firmly
+FIRM_SHARE = 0.8  # of the samples, for the others to be left out of the outline
 HIDDEN_M = 0.012  # samples round a point of the outline that say whether it is an edge
 HIDDEN_SHARE = 0.75  # of the edges there that are hidden, above which it is no edge
 CELL_M = 0.002  # of the image whose contour is the outline
@@ -190,7 +192,13 @@ def _unfolded(surface: Surface, plane: Float, config: RotationConfig) -> Unfolde
     folded = overlap(plane, distances.bound_m, side[distances.chosen])
     sheet = ~links.rim
     edge = sheet_edges(samples.xyz, samples.normal, links.a[sheet], links.b[sheet], config)
-    outline = outline_of(points.uv, points.sigma_m, edge[placed], config)
+    if folded > config.untrusted_overlap:
+        text = f"{100 * folded:.0f} % of the surface lies on more of its own side: not laid flat"
+        notices.append(Notice("untrusted", text))
+    # what is placed round rims alone has upper bounds only, and so lies too far out
+    firm = (distances.around_sheet.sum(1) >= FIRM)[placed]
+    firm |= firm.mean() < FIRM_SHARE  # too few would leave holes
+    outline = outline_of(points.uv[firm], points.sigma_m[firm], edge[placed][firm], config)
     return Unfolded(
         surface, plane, points, side[placed], outline, points.uv, stress, folded, tuple(notices)
     )

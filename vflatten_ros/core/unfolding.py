@@ -91,7 +91,7 @@ def carry(points: Float, before: Float, after: Float) -> Float:
 
 def _along(outline: Float, per_edge: int = 20) -> Float:
     """Points along every edge of a closed outline, alike in number."""
-    share = (np.arange(per_edge) / per_edge)[:, None]
+    share = np.linspace(0.0, 1.0, per_edge, endpoint=False)[:, None]
     after = np.roll(outline, -1, axis=0)
     points: Float = (outline[:, None] * (1 - share) + after[:, None] * share).reshape(-1, 2)
     return points

@@ -93,8 +93,8 @@ def _along(outline: Float, per_edge: int = 20) -> Float:
     """Points along every edge of a closed outline, alike in number."""
     share = np.linspace(0.0, 1.0, per_edge, endpoint=False)[:, None]
     after = np.roll(outline, -1, axis=0)
-    points: Float = (outline[:, None] * (1 - share) + after[:, None] * share).reshape(-1, 2)
-    return points
+    points: Float = outline[:, None] + (after - outline)[:, None] * share
+    return points.reshape(-1, 2)
 
 
 def _majorise(plane: Float, bound: Float, near: Bool, spread: float) -> Float:

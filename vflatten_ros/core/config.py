@@ -287,9 +287,6 @@ class AssemblyConfig(Checked):
 
     rotations: int = option(60, "Rotations tried.", low=4, high=3600)
     hinges: int = option(5, "Places tried for the tip of a fold between two pieces.", low=1, high=100)
-    tip_m: float = option(
-        0.16, "The tip of a fold may be so far beyond where its sides are seen, m.", low=0.0, high=1.0
-    )
     categories: int = option(
         3, "Likeliest categories for which pieces are placed with care.", low=1, high=100
     )
@@ -306,7 +303,7 @@ class AssemblyConfig(Checked):
         0.004, "Pieces may overlap by so much in the plane, m.", low=0.0, high=0.1
     )
     hinge_m: float = option(
-        0.02, "How far from there the pieces may meet in the plane, one sigma, m.", low=0.001, high=0.5
+        0.012, "How far from there the pieces may meet in the plane, one sigma, m.", low=0.001, high=0.5
     )
     misfit_m: float = option(
         0.01, "How far ends may be from the category's outline, one sigma, m.", low=0.001, high=0.1

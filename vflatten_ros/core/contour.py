@@ -12,27 +12,22 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.arrays import as_points
 from vflatten_ros.core.config import ContourConfig
 from vflatten_ros.core.errors import InvalidInput
-from vflatten_ros.core.values import Bool, Float, Int, Outline
+from vflatten_ros.core.values import Bool, FlatSurface, Float, Outline
+
+MOST_ENDS = 0.3  # of a gap's rim may be ends of the item, for the gap to be filled
 
 
-def trace_outline(
-    uv: Float, sigma_m: Float, edge: Bool, cells: Int, config: ContourConfig, margin_m: float = 0.0
-) -> Outline:
+def trace_outline(surface: FlatSurface, sigma_m: float, margin_m: float, config: ContourConfig) -> Outline:
     """Outline of the union of flattened cells.
 
     Parameters
     ----------
-    uv : ndarray of shape (n, 2)
-        Flattened points, metres.
-    sigma_m : ndarray of shape (n,)
-        Their standard deviations.
-    edge : ndarray of shape (n,)
-        False where the surface goes on unseen beside the point.
-    cells : ndarray of shape (m, 4)
-        Rows of `uv` around every small quadrilateral of the surface.
-    config : ContourConfig
+    surface : FlatSurface
+    sigma_m : float
+        Standard deviation of its points.
     margin_m : float
         How far the surface reaches beyond its outermost points: half a pixel.
+    config : ContourConfig
 
     Returns
     -------
@@ -44,14 +39,15 @@ def trace_outline(
     InvalidInput
         Points that are not finite, or no area.
     """
-    uv = as_points(uv, "uv", 2)
-    if not len(cells):
+    uv, edge = as_points(surface.uv, "uv", 2), surface.edge
+    if not len(surface.cells):
         raise InvalidInput("outline: no surface between the flattened points")
-    reach = config.close_m + margin_m + 4 * config.cell_m
+    reach = max(config.close_m, config.bridge_m) + margin_m + 4 * config.cell_m
     low = uv.min(axis=0) - reach
     shape = tuple(np.ceil((uv.max(axis=0) + reach - low) / config.cell_m).astype(int)[::-1] + 1)
-    image = _filled(uv[cells], low, shape, config.cell_m)
+    image = _filled(uv[surface.cells], low, shape, config.cell_m)
     image = _closed(image, config.close_m / config.cell_m)
+    image = _bridged(image, uv, edge, low, config)
     contour = _largest(image)
     line = contour * config.cell_m + low
     line = _evenly(line, config.spacing_m)
@@ -61,7 +57,7 @@ def trace_outline(
     distance, nearest = cKDTree(uv).query(line, k=min(4, len(uv)))
     nearest = nearest.reshape(len(line), -1)
     seen = (distance.reshape(len(line), -1)[:, 0] < config.seen_m + margin_m) & edge[nearest].any(axis=1)
-    sigma = np.hypot(sigma_m[nearest[:, 0]], 0.5 * config.cell_m)
+    sigma = np.full(len(line), np.hypot(sigma_m, 0.5 * config.cell_m))
     return Outline(line, np.where(seen, sigma, np.maximum(sigma, 0.03)), ~seen)
 
 
@@ -106,6 +102,24 @@ def _closed(image: Bool, radius: float) -> Bool:
     wide = (away <= radius).astype(np.uint8)
     inner = cv2.distanceTransform(np.pad(wide, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     return (inner > radius) | image
+
+
+def _bridged(image: Bool, uv: Float, edge: Bool, low: Float, config: ContourConfig) -> Bool:
+    """Wider gaps filled if nearly all around them was unseen: a fold's gap goes, a leg's gap stays."""
+    gap = _closed(image, config.bridge_m / config.cell_m) & ~image
+    count, label = cv2.connectedComponents(gap.astype(np.uint8), connectivity=4)
+    rim = image & (cv2.dilate(gap.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    at = np.argwhere(rim)
+    if not len(at):
+        return image
+    k = min(8, len(uv))
+    near = cKDTree(uv).query(at[:, ::-1] * config.cell_m + low, k=k)[1].reshape(len(at), k)
+    ends = edge[near].mean(axis=1) > 0.5
+    beside = cv2.dilate(label.astype(np.float32), np.ones((3, 3), np.uint8))[tuple(at.T)].astype(int)
+    share = np.bincount(beside, ends, count) / np.maximum(np.bincount(beside, minlength=count), 1)
+    fill = share < MOST_ENDS
+    fill[0] = False
+    return image | fill[label]
 
 
 def _largest(image: Bool) -> Float:

@@ -38,6 +38,7 @@ class Joint:
     relations: Relations
     kind: Int  # (m,) LOCAL, OVERLAP or PAIR
     piece: Int  # (n,) number of the connected piece, largest first
+    own_patch: Int  # (n,) patch in the sample's own view, -1: none
 
     @property
     def weight(self) -> Float:
@@ -176,7 +177,8 @@ def join(
         parts.append(over)
         kinds.append(np.full(len(over.i), OVERLAP))
     relations, kind = joined(*parts), np.concatenate(kinds)
-    return Joint(points, normals, relations, kind, _pieces(len(points), relations))
+    piece = _pieces(len(points), relations)
+    return Joint(points, normals, relations, kind, piece, np.r_[a.patch, b.patch])
 
 
 def _overlap(

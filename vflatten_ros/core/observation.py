@@ -24,6 +24,7 @@ class Observation:
     surface: Surface  # hanger frame
     place: Int  # (n, 2) row and column of every point on the grid of rays
     patch: Int  # (n,) smooth patch, largest first; -1: none
+    fringe: Int  # (n,) the same with the points between patches
     edge: Bool  # (n,) the item may end at this point; False: it goes on unseen
 
 
@@ -38,10 +39,11 @@ def observe(view: View, config: Config, progress: Progress) -> Observation:
     place = np.rint(place).astype(np.int64)
     depth = depth - depth.min() + PARALLEL_M if surface.rays.parallel else depth
     cells, first, cell = np.unique(place, axis=0, return_index=True, return_inverse=True)
-    patch, hidden = find_patches(cells, depth[first], config.patches)
+    found = find_patches(cells, depth[first], config.patches)
     cell = cell.reshape(-1)
     facing = np.einsum("ij,ij->i", surface.normals, toward)
-    return Observation(view, surface, place, patch[cell], ~hidden[cell] & (facing > GRAZING))
+    edge = ~found.hidden[cell] & (facing > GRAZING)
+    return Observation(view, surface, place, found.patch[cell], found.fringe[cell], edge)
 
 
 def _camera(view: View) -> Float:
@@ -83,5 +85,5 @@ def quads(observation: Observation, keep: Bool) -> Int:
     corner = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1)
     corner = corner.reshape(-1, 4)
     corner = corner[(corner >= 0).all(axis=1)]
-    patch = observation.patch[corner]
+    patch = observation.fringe[corner]
     return corner[(patch == patch[:, :1]).all(axis=1)]

@@ -8,6 +8,7 @@ taken for a step; inverse depth is used because there a plane is linear in the p
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +34,17 @@ class _Borders:
     open: Bool  # measured on both sides and without a step
 
 
-def find_patches(place: Int, depth: Float, config: PatchConfig) -> tuple[Int, Bool]:
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Smooth patches of one view; n points."""
+
+    patch: Int  # (n,) number of the point's patch, largest first; -1: beside a step, or patch too small
+    fringe: Int  # (n,) the same with the points between patches, which may be of the one or the other
+    hidden: Bool  # (n,) an end of what is seen that need not be an end of the cloth: more of the item,
+    # as near or nearer, lies just beyond
+
+
+def find_patches(place: Int, depth: Float, config: PatchConfig) -> Patches:
     """Part the measured pixels of one view into smooth patches.
 
     Parameters
@@ -46,10 +57,7 @@ def find_patches(place: Int, depth: Float, config: PatchConfig) -> tuple[Int, Bo
 
     Returns
     -------
-    patch : ndarray of shape (n,)
-        Number of the point's patch, largest first; -1 beside a step or in a patch too small.
-    hidden : ndarray of shape (n,)
-        Beside a nearer layer: cloth goes on behind it, the patch does not end there.
+    Patches
     """
     index = np.full(np.ptp(place, axis=0) + 3, -1, dtype=np.int64)
     index[tuple((place - place.min(axis=0) + 1).T)] = np.arange(len(place))
@@ -62,7 +70,9 @@ def find_patches(place: Int, depth: Float, config: PatchConfig) -> tuple[Int, Bo
     core = np.zeros(len(place), dtype=bool)
     core[order] = solid
     patch = _components(links[core[links].all(axis=1)], core, config.min_points)
-    return _grown(patch, links, config.margin_px + 2), _hidden(index, borders, depth)
+    patch = _grown(patch, links, config.margin_px + 2)
+    fringe = _grown(patch, links, config.gap_px)
+    return Patches(patch, fringe, _hidden(index, borders, depth, config))
 
 
 def _borders(index: Int, depth: Float, config: PatchConfig) -> list[_Borders]:
@@ -153,16 +163,37 @@ def _grown(patch: Int, links: Int, rounds: int) -> Int:
     return patch
 
 
-def _hidden(index: Int, borders: list[_Borders], depth: Float, within: int = 2) -> Bool:
-    """Points within two pixels of a step down to them from a nearer layer."""
-    behind = np.zeros(index.shape, dtype=np.uint8)
-    for b in borders:
-        for side, other in ((b.first, b.second), (b.second, b.first)):
-            both = (index[side] >= 0) & (index[other] >= 0) & ~b.open
-            nearer = depth[index[other]] < depth[index[side]]
-            behind[side] |= (both & nearer).astype(np.uint8)
-    size = 2 * within + 1
-    wide = cv2.dilate(behind, np.ones((size, size), np.uint8)) > 0
+def _hidden(index: Int, borders: list[_Borders], depth: Float, config: PatchConfig) -> Bool:
+    """Points at an end of what is seen, beyond which lies cloth as near or nearer to the camera.
+
+    The next measured pixel beyond the end counts, if it is not too far away in the image.
+    """
+    right, down = (np.zeros(index.shape, dtype=bool) for _ in range(2))
+    right[borders[0].first] = borders[0].open
+    down[borders[1].first] = borders[1].open
+    known = index >= 0
+    z = np.where(known, depth[index], np.inf)
+    balance = np.zeros(index.shape)  # ends before more cloth, less those before nothing
+    for axis, way, joined in ((1, 1, right), (1, -1, right), (0, 1, down), (0, -1, down)):
+        joined = joined if way > 0 else _beyond(joined, axis, -1, False)
+        end = known & ~joined
+        waiting = end.copy()
+        for step in range(1, config.gap_px + 1):
+            other = _beyond(z, axis, step * way, np.inf)
+            found = waiting & np.isfinite(other)
+            balance += 2.0 * (found & (other < z + config.step_m))
+            waiting &= ~found
+        balance -= end
+    # the outline is ragged: single pixels face their neighbours along it
+    around = cv2.boxFilter(balance, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
     hidden = np.zeros(len(depth), dtype=bool)
-    hidden[index[index >= 0]] = wide[index >= 0]
+    hidden[index[known]] = around[known] > 0.5
     return hidden
+
+
+def _beyond(image: NDArray[Any], axis: int, by: int, outside: float) -> NDArray[Any]:
+    """The image's value so many pixels further along the axis."""
+    moved = np.roll(image, -by, axis=axis)
+    lost = slice(-by, None) if by > 0 else slice(None, -by)
+    moved[(slice(None), lost) if axis else (lost, slice(None))] = outside
+    return moved

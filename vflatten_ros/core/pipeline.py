@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from vflatten_ros.core.assembly import place_pieces
-import numpy as np
-
+from vflatten_ros.core.assembly import assemble
 from vflatten_ros.core.config import Config
-from vflatten_ros.core.errors import NotEnoughViews
+from vflatten_ros.core.errors import DisconnectedSurface, NotEnoughViews
 from vflatten_ros.core.measurement import measure
-from vflatten_ros.core.recognition import Recognition, recognise
-from vflatten_ros.core.rotation import unfold_views
+from vflatten_ros.core.one_view import flatten_one_view
+from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
+from vflatten_ros.core.recognition import _finish as finish
+from vflatten_ros.core.rotation import Unfolded, turn_parts, unfold_views, unfold_without_necks
+from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.two_views import flatten_two_views
 from vflatten_ros.core.values import (
@@ -26,7 +28,7 @@ from vflatten_ros.core.values import (
     no_progress,
 )
 
-HALF_PIXEL_M = 0.00125  # how far cloth reaches beyond its outermost pixels' centres
+TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 
 
 def flatten_garment(
@@ -57,30 +59,40 @@ def flatten_garment(
     if not views:
         raise NotEnoughViews("no views to flatten")
     method = {"kita2019": _kita2019, "rotation": _rotation}[config.method]
-    flattened = method(views, correspondences, config, progress)
-    return _described(flattened, views, templates, config, progress)
+    flattened, settled = method(views, correspondences, templates, config, progress)
+    return _described(flattened, settled, views, templates, config, progress)
 
 
 def _kita2019(
     views: Sequence[View],
     correspondences: Sequence[Correspondence],
+    templates: Sequence[Template],
     config: Config,
     progress: Progress,
-) -> Flattened:
-    """The paper's method: two views, a few corresponding points."""
-    return flatten_two_views(views, correspondences, config, progress)
+) -> tuple[Flattened, Recognition | None]:
+    """The paper's method: two views and a few corresponding points, or one view alone."""
+    if len(views) == 1:
+        return flatten_one_view(views[0], config, progress), None
+    return flatten_two_views(views, correspondences, config, progress), None
 
 
 def _rotation(
     views: Sequence[View],
     correspondences: Sequence[Correspondence],
+    templates: Sequence[Template],
     config: Config,
     progress: Progress,
-) -> Flattened:
+) -> tuple[Flattened, Recognition | None]:
     """The automatic method: all views of a rotation."""
-    unfolded = unfold_views(views, correspondences, config.rotation, progress)
+    unfolded, found = _likeliest(views, correspondences, tuple(templates), config, progress)
+    for _ in range(TURNS if found.category != UNKNOWN else 0):
+        fit = found.fits[found.category]
+        rest = place(fit.template, fit.pose, fit.template.at_rest(fit.state))[0]
+        k = fit.template.vertices
+        unfolded = turn_parts(unfolded, fit.points()[:k], rest[:k], config.rotation)
+        found = _refitted(unfolded, found, tuple(templates), config)
     none = np.zeros(0)
-    return Flattened(
+    flattened = Flattened(
         points=unfolded.points,
         start_uv=None,
         lines=GeodesicLines(np.zeros((0, 2, 3)), none.astype(np.int64), none, none, none > 0),
@@ -88,10 +100,42 @@ def _rotation(
         correspondences=(),
         notices=unfolded.notices,
     )
+    return flattened, found
+
+
+def _likeliest(
+    views: Sequence[View],
+    correspondences: Sequence[Correspondence],
+    templates: tuple[Template, ...],
+    config: Config,
+    progress: Progress,
+) -> tuple[Unfolded, Recognition]:
+    """The surface as linked, or if that makes a doubtful item, with its false necks cut."""
+    unfolded = unfold_views(views, correspondences, config.rotation, progress)
+    progress("recognition", 0.0)
+    found = recognise(unfolded.outline, unfolded.points, templates, config.recognition)
+    if _certainty(found) > config.rotation.certain and unfolded.overlap < config.rotation.overlaid:
+        return unfolded, found
+    try:
+        other = unfold_without_necks(unfolded, config.rotation, progress)
+    except DisconnectedSurface:
+        return unfolded, found
+    again = recognise(other.outline, other.points, templates, config.recognition)
+    overlaid, gained = unfolded.overlap, _certainty(again) - _certainty(found)
+    flatter = overlaid > config.rotation.overlaid and other.overlap < 0.5 * overlaid
+    clearer = gained > 0.2 and other.overlap < overlaid + 0.02
+    return (other, again) if (flatter and gained > -0.1) or clearer else (unfolded, found)
+
+
+def _certainty(found: Recognition) -> float:
+    """0-1: that the item is of a known category, and how much of its outline the fit explains."""
+    known = 1.0 - found.probabilities.get(UNKNOWN, 0.0)
+    return known * (found.fit.explained if found.fit is not None else 0.0)
 
 
 def _described(
     flattened: Flattened,
+    settled: Recognition | None,
     views: Sequence[View],
     templates: Sequence[Template],
     config: Config,
@@ -99,7 +143,10 @@ def _described(
 ) -> FlatGarment:
     """Category, sizes and places of a flattened item."""
     progress("recognition", 0.0)
-    flattened, recognition = _recognised(flattened, tuple(templates), config, progress)
+    if settled is not None:
+        recognition = settled
+    else:
+        flattened, recognition = _recognised(flattened, tuple(templates), config, progress)
     points, outline = flattened.points, flattened.outline
     progress("measurement", 0.0)
     measured = measure(recognition, outline, points, config.measurement)
@@ -126,27 +173,49 @@ def _described(
     )
 
 
+def _refitted(
+    flattened: Unfolded, settled: Recognition, templates: tuple[Template, ...], config: Config
+) -> Recognition:
+    """The settled category, fitted to the item as it lies now; legs together look like a skirt."""
+    only = tuple(t for t in templates if t.category == settled.category)
+    if not only:
+        return settled
+    fitted = recognise(flattened.outline, flattened.points, only, config.recognition)
+    fit = fitted.fits[settled.category]
+    near = np.maximum(fit.edge_seen[:, 0], np.roll(fit.edge_seen[:, -1], 1))
+    k = fit.template.vertices
+    return replace(
+        settled,
+        fit=fit,
+        template_uv=fit.points()[:k],
+        template_seen=near[:k] > 0.5,
+        fits={**settled.fits, settled.category: fit},
+    )
+
+
 def _recognised(
     flattened: Flattened, templates: tuple[Template, ...], config: Config, progress: Progress
 ) -> tuple[Flattened, Recognition]:
     """Category of the item; loose pieces are placed as the likeliest categories have them."""
     found = recognise(flattened.outline, flattened.points, templates, config.recognition)
-    if len(flattened.pieces) < 2 or not config.assembly.categories:
+    if len(flattened.pieces) < 2 or not config.assembly.alternations:
         return flattened, found
-    placed = []
-    for template in templates:
-        fit = found.fits[template.category]
-        outline = fit.points()[: template.vertices]
-        whole, cost = place_pieces(flattened, outline, HALF_PIXEL_M, config.assembly, config.contour)
-        chance = np.log(max(found.probabilities[template.category], 1e-6)) - cost
-        placed.append((chance, cost, template.category, whole))
-    placed.sort(key=lambda p: -p[0])
-    best: tuple[float, Flattened, Recognition] | None = None
-    for done, (_, cost, category, whole) in enumerate(placed[: config.assembly.categories]):
-        progress("recognition", (done + 1) / (config.assembly.categories + 1))
-        again = recognise(whole.outline, whole.points, templates, config.recognition)
-        chance = np.log(max(again.probabilities[category], 1e-6)) - cost
-        if best is None or chance > best[0]:
-            best = (chance, whole, again)
-    assert best is not None
-    return best[1], best[2]
+    progress("recognition", 0.4)
+    tried = assemble(flattened, templates, config)
+    best = tried[0]
+    whole = best.flattened
+    again = recognise(whole.outline, whole.points, templates, config.recognition)
+    fit = finish(best.template, best.evidence, best.pose[None], best.state[None])
+    odds = np.exp(np.array([t.chance for t in tried]) - best.chance)
+    shares = {t.template.category: float(o / odds.sum()) for t, o in zip(tried, odds, strict=True)}
+    near = np.maximum(fit.edge_seen[:, 0], np.roll(fit.edge_seen[:, -1], 1))
+    count = best.template.vertices
+    return whole, Recognition(
+        category=best.template.category,
+        scores=again.scores,
+        probabilities={**dict.fromkeys(again.probabilities, 0.0), **shares},
+        fit=fit,
+        template_uv=fit.points()[:count],
+        template_seen=near[:count] > 0.5,
+        fits={**again.fits, best.template.category: fit},
+    )

@@ -48,7 +48,9 @@ from vflatten_ros.core.values import (
     Bool,
     Correspondence,
     DistanceNetwork,
+    FlatPiece,
     FlatPoints,
+    FlatSurface,
     Flattened,
     Float,
     GeodesicLines,
@@ -62,6 +64,8 @@ from vflatten_ros.core.values import (
 
 LINES_PER_POINT = 3  # geodesic lines that start at a boundary point
 POINT_SIGMA_M = 0.002  # of a flattened point, whatever its stress
+MISFIT_M = 0.003  # of neighbours, beyond which they lose their say when unrolled
+FEWEST_SAMPLES = 40  # of a piece that is worth placing
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,24 +189,63 @@ def _from_surfaces(pair: _Pair, config: Config, progress: Progress) -> Flattened
     )
     progress("integration", 0.0)
     joint = join(a.samples, b.samples, np.arange(len(pair.at_a)), motion, config.integration)
-    keep = _main_piece(joint, len(a.source))
     lines, measured = _surface_lines(pair, (a, b), config, progress)
-    rows = np.flatnonzero(keep)
-    number = np.full(len(keep), -1, dtype=np.int64)
-    number[rows] = np.arange(len(rows))
-    inside = np.flatnonzero(keep[joint.relations.i] & keep[joint.relations.j])
-    relations = _renumbered(joint.relations.part(inside), number)
-    weight = joint.weight[inside]
-    start, frame, _ = unroll(len(rows), relations, weight, 0.003)
-    network = merged(
-        [_part(network_of(joint, config.integration), number), _part(measured, number)]
+    network = merged([network_of(joint, config.integration), measured])
+    pieces = tuple(
+        _piece(pair, (a, b), joint, network, number, motion, config, progress)
+        for number in _pieces_to_place(joint, len(a.source), len(pair.at_a))
     )
-    uv, stress = flatten(network, start, config.flattening, progress)
-    frame = frames_of(relations, uv, frame, weight)
     progress("outline", 0.0)
-    points = _flat_points(pair, (a, b), rows, uv, stress)
-    outline = _outline_of(pair, joint, len(a.source), rows, uv, frame, motion, config)
-    return Flattened(points, start, lines, outline, pair.used, pair.notices + _unplaced(joint, keep))
+    outline = trace_outline(pieces[0].surface, POINT_SIGMA_M, _half_pixel(pair), config.contour)
+    notices = pair.notices + _creases(joint, pieces)
+    return Flattened(
+        pieces[0].points, pieces[0].start_uv, lines, outline, pair.used, notices, pieces
+    )
+
+
+def _half_pixel(pair: _Pair) -> float:
+    return 0.5 * min(pair.a.surface.spacing_m, pair.b.surface.spacing_m)
+
+
+def _pieces_to_place(joint: Joint, count_a: int, pairs: int) -> list[int]:
+    """The largest piece, which must hold cloth of both views, and others with corresponding points.
+
+    Corresponding points are on the side of the item that is to be flattened; a piece without any may
+    be of the other side, or the inside.
+    """
+    main = joint.piece == 0
+    if not (main[:count_a].any() and main[count_a:].any()):
+        raise DisconnectedSurface(
+            "nothing joins the surfaces of the two views: give corresponding points on parts that "
+            "both views show, or views nearer in angle"
+        )
+    marked = np.r_[joint.piece[:pairs], joint.piece[count_a : count_a + pairs]]
+    size = np.bincount(joint.piece)
+    return [0, *(int(p) for p in np.unique(marked) if p > 0 and size[p] >= FEWEST_SAMPLES)]
+
+
+def _piece(
+    pair: _Pair,
+    sampled: tuple[_Sampled, _Sampled],
+    joint: Joint,
+    network: DistanceNetwork,
+    number: int,
+    motion: Float,
+    config: Config,
+    progress: Progress,
+) -> FlatPiece:
+    """Flatten one connected piece of the surface."""
+    rows = np.flatnonzero(joint.piece == number)
+    renumber = np.full(len(joint.piece), -1, dtype=np.int64)
+    renumber[rows] = np.arange(len(rows))
+    inside = np.flatnonzero(renumber[joint.relations.i] >= 0)
+    relations, weight = _renumbered(joint.relations.part(inside), renumber), joint.weight[inside]
+    start, frame, _ = unroll(len(rows), relations, weight, MISFIT_M)
+    uv, stress = flatten(_part(network, renumber), start, config.flattening, progress)
+    frame = frames_of(relations, uv, frame, weight)
+    points = _flat_points(pair, sampled, rows, uv, stress)
+    surface = _dense(pair, joint, len(sampled[0].source), rows, uv, frame, motion, config)
+    return FlatPiece(points, start, surface)
 
 
 def _sample(observation: Observation, corresponding: Int, config: Config) -> _Sampled:
@@ -215,17 +258,6 @@ def _sample(observation: Observation, corresponding: Int, config: Config) -> _Sa
     source = np.r_[corresponding, ring, inner]
     samples = SurfaceSamples(surface.points[source], surface.normals[source], patch[source])
     return _Sampled(samples, source, len(corresponding) + len(ring))
-
-
-def _main_piece(joint: Joint, count_a: int) -> Bool:
-    """The largest connected piece; it must hold cloth of both views."""
-    keep = joint.piece == 0
-    if not (keep[:count_a].any() and keep[count_a:].any()):
-        raise DisconnectedSurface(
-            "nothing joins the surfaces of the two views: give corresponding points on parts that "
-            "both views show, or views nearer in angle"
-        )
-    return keep
 
 
 def _surface_lines(
@@ -300,7 +332,7 @@ def _flat_points(
     return FlatPoints(uv, xyz, view_id, pixel, sigma, stress, np.zeros(len(rows), dtype=bool))
 
 
-def _outline_of(
+def _dense(
     pair: _Pair,
     joint: Joint,
     count_a: int,
@@ -309,50 +341,44 @@ def _outline_of(
     frame: Complex,
     motion: Float,
     config: Config,
-) -> Outline:
-    """Outline of all pixels of the patches that were placed."""
-    places, edges, cells = [], [], []
+) -> FlatSurface:
+    """All pixels near the samples of one piece, carried to the plane by the samples around them."""
+    parts: list[FlatSurface] = []
     shift = 0
     for side, observation in enumerate((pair.a, pair.b)):
         mine = (rows >= count_a) == bool(side)
-        samples, normals = joint.points[rows[mine]], joint.normals[rows[mine]]
+        if not mine.any():
+            continue
         points = observation.surface.points
-        if side:
-            points = points @ motion[:3, :3].T + motion[:3, 3]
-        distance, near = cKDTree(samples).query(points, k=3)
+        moved = points @ motion[:3, :3].T + motion[:3, 3] if side else points
+        samples = joint.points[rows[mine]]
+        distance, near = cKDTree(samples).query(moved, k=3)
         reach = 1.5 * config.integration.spacing_m
-        keep = (observation.patch >= 0) & (distance[:, 0] < reach)
-        distance = np.where(distance < reach, distance, np.inf)
-        near = np.where(np.isfinite(distance), near, 0)
-        placed = np.full((len(points), 2), 0.0)
-        placed[keep] = carry(
-            points[keep], samples, normals, uv[mine], frame[mine], near[keep], distance[keep]
+        keep = (distance[:, 0] < reach) & (observation.fringe >= 0)
+        keep &= np.isin(observation.fringe, joint.own_patch[rows[mine]])
+        distance = np.where(distance < reach, distance, np.inf)[keep]
+        near = np.where(np.isfinite(distance), near[keep], 0)
+        placed = carry(
+            moved[keep], samples, joint.normals[rows[mine]], uv[mine], frame[mine], near, distance
         )
         number = np.full(len(points), -1, dtype=np.int64)
         number[keep] = shift + np.arange(keep.sum())
-        cells.append(number[quads(observation, keep)])
-        places.append(placed[keep])
-        edges.append(observation.edge[keep])
+        cells = number[quads(observation, keep)]
+        parts.append(FlatSurface(placed, points[keep], observation.edge[keep], cells))
         shift += int(keep.sum())
-    everywhere = np.concatenate(places)
-    return trace_outline(
-        everywhere,
-        np.full(len(everywhere), POINT_SIGMA_M),
-        np.concatenate(edges),
-        np.concatenate(cells),
-        config.contour,
-        0.5 * min(pair.a.surface.spacing_m, pair.b.surface.spacing_m),
+    return FlatSurface(
+        np.concatenate([p.uv for p in parts]),
+        np.concatenate([p.xyz_hanger for p in parts]),
+        np.concatenate([p.edge for p in parts]),
+        np.concatenate([p.cells for p in parts]),
     )
 
 
-def _unplaced(joint: Joint, keep: Bool) -> tuple[Notice, ...]:
-    share = 1.0 - keep.mean()
+def _creases(joint: Joint, pieces: tuple[FlatPiece, ...]) -> tuple[Notice, ...]:
+    share = 1.0 - len(pieces[0].points.uv) / len(joint.piece)
     if share < 0.05:
         return ()
-    text = (
-        f"{100 * share:.0f} % of what the views show is joined to the rest only behind creases and was "
-        "left out"
-    )
+    text = f"{100 * share:.0f} % of what the views show is joined to the rest only behind creases"
     return (Notice("hidden_crease", text),)
 
 

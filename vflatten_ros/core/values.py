@@ -169,6 +169,25 @@ class Outline:
 
 
 @dataclass(frozen=True, eq=False)
+class FlatSurface:
+    """All observed points of a flattened piece of cloth, and the small squares between them."""
+
+    uv: Float  # (n, 2), flat frame
+    xyz_hanger: Float  # (n, 3)
+    edge: Bool  # (n,) False: the cloth goes on unseen beside the point
+    cells: Int  # (m, 4) points around every square
+
+
+@dataclass(frozen=True, eq=False)
+class FlatPiece:
+    """Cloth that lies in one piece; its place beside other pieces is not known."""
+
+    points: FlatPoints
+    start_uv: Float  # (n, 2) where its flattening started, rows as points
+    surface: FlatSurface
+
+
+@dataclass(frozen=True, eq=False)
 class Flattened:
     """What a method makes of the views, before the category is known."""
 
@@ -178,6 +197,7 @@ class Flattened:
     outline: Outline
     correspondences: tuple[Correspondence, ...]  # that were used
     notices: tuple[Notice, ...]
+    pieces: tuple[FlatPiece, ...] = field(default=())  # the largest is the outline's; others are loose
 
 
 @dataclass(frozen=True)

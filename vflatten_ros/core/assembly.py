@@ -1,0 +1,449 @@
+"""Places loose pieces of a flattened item beside its main piece, as a category's outline has them.
+
+A hidden fold cuts the observed surface apart: how far the cloth turns in the fold is not seen. What is
+known of a loose piece: laid flat, the fold opens about its tip; the piece does not overlap the others;
+it lies inside the item's outline, with its own ends on that outline. The outline is the category's. It
+and the places of the pieces are found in turns, for the likeliest categories; the best explanation
+wins. Sizes that rest on a placed piece have its error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.config import AssemblyConfig, Config, ContourConfig
+from vflatten_ros.core.contour import trace_outline
+from vflatten_ros.core.evidence import CELL_M as EVIDENCE_CELL_M
+from vflatten_ros.core.evidence import Evidence, evidence_from
+from vflatten_ros.core.partial_match import matches
+from vflatten_ros.core.template_fit import linearise, place, refine
+from vflatten_ros.core.templates import Template
+from vflatten_ros.core.values import (
+    FlatPiece,
+    FlatPoints,
+    FlatSurface,
+    Flattened,
+    Float,
+)
+
+MOST = 100  # points of a piece's ends, and of its inside, that are judged
+CELL_M = 0.004  # of the images that judge a place
+COARSE = (12.0, 9.0)
+MOST_FITS = 8  # fits of a category that are refined
+STIFF = 0.05  # of the swing that is allowed where paths along the cloth are uncertain
+NEAR_M = 0.02  # beyond the main piece's outline
+CUTS = (6.0, 5.0, 4.0, 3.0, 3.0, 3.0)  # of the fits of the outline, in sigmas
+HALF_PIXEL_M = 0.00125  # cloth reaches beyond the centres of its outermost pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """All pieces as one category has them."""
+
+    template: Template
+    pose: Float  # (3,) of the template, see template_fit
+    state: Float  # (m,)
+    evidence: Evidence  # the ends of all pieces
+    flattened: Flattened  # in one piece
+    chance: float  # logarithm, up to a constant that all categories share
+
+
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    """Points of a piece's outline that may be ends of the item, in the piece's plane."""
+
+    uv: Float  # (n, 2)
+    normal: Float  # (n, 2) outward
+    spacing_m: float  # of the points
+
+
+@dataclass(frozen=True, eq=False)
+class _Hinges:
+    """Places where a loose piece may be joined to the main one."""
+
+    there: Float  # (h, 2) in the main piece's plane
+    here: Float  # (h, 2) in its own
+    sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Turn:
+    """A rigid motion in the plane: uv -> R(angle) (uv - moving) + fixed."""
+
+    angle: float
+    fixed: Float  # (2,)
+    moving: Float  # (2,)
+
+    def __call__(self, uv: Float) -> Float:
+        return self.direction(uv - self.moving) + self.fixed
+
+    def direction(self, vector: Float) -> Float:
+        """Turn directions."""
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        out: Float = vector @ np.array([[cos, sin], [-sin, cos]])
+        return out
+
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """Distance images by which a place is judged."""
+
+    low: Float  # (2,)
+    signed: Float  # distance to the category's outline, inside negative, m
+    taken: Float  # depth inside the pieces already placed, m, 0 outside
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """What all categories need to know of the pieces."""
+
+    flattened: Flattened
+    main: Evidence  # of the main piece
+    ends: tuple[_Ends, ...]
+    inner: tuple[Float, ...]
+    whole_inner: Float  # of the main piece, in order to know its extent
+    hinges: tuple[_Hinges, ...]  # of each loose piece
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A category's outline and the places of the pieces, on the way to an assembly."""
+
+    template: Template
+    pose: Float
+    state: Float
+    turns: tuple[_Turn, ...]
+    placed: tuple[FlatPiece, ...]
+    cost: float  # of the places, beside what the outline's fit says
+    energy: float  # of the outline's fit
+
+
+def assemble(flattened: Flattened, templates: Sequence[Template], config: Config) -> list[Assembly]:
+    """Place the loose pieces as categories have them, and fit the categories to all pieces, in turns.
+
+    Parameters
+    ----------
+    flattened : Flattened
+        With its pieces; the main one, which is the first, stays where it is.
+    templates : sequence of Template
+    config : Config
+
+    Returns
+    -------
+    list of Assembly
+        For the likeliest categories, best first.
+    """
+    prepared = _prepare(flattened, config)
+    kept = []
+    for template in map(_stiff, templates):
+        fits = _first_fits(prepared, template, config)
+        trials = [
+            _alternate(prepared, _trial(prepared, template, pose, state, config), config, 1)
+            for pose, state in fits
+        ]
+        kept.append(min(trials, key=lambda t: t.energy + t.cost))
+    kept.sort(key=lambda t: t.energy + t.cost)
+    best = [
+        _alternate(prepared, t, config, config.assembly.alternations)
+        for t in kept[: config.assembly.categories]
+    ]
+    return sorted((_finished(prepared, t, config) for t in best), key=lambda a: -a.chance)
+
+
+def _stiff(template: Template) -> Template:
+    """Parts of a piece of observed cloth are not turned against one another: that would be stress."""
+    return replace(template, swing=STIFF * template.swing)
+
+
+def _first_fits(
+    prepared: _Prepared, template: Template, config: Config
+) -> list[tuple[Float, Float]]:
+    """Poses and cuts of an outline of which the main piece may be a part only."""
+    still = _Turn(0.0, np.zeros(2), np.zeros(2))
+    evidence = _ends_evidence(prepared, prepared.main, (still,), config)
+    pose, state = matches(template, prepared.ends[0].uv, prepared.whole_inner, MOST_FITS)
+    pose, state, energy = refine(template, evidence, pose, state, COARSE + CUTS)
+    return [(pose[k], state[k]) for k in _distinct(pose, energy)]
+
+
+def _distinct(pose: Float, energy: Float) -> list[int]:
+    """The best of each group of alike poses, three at most."""
+    chosen: list[int] = []
+    for k in np.argsort(energy, kind="stable"):
+        off = [np.abs(np.r_[np.sin(0.5 * (pose[k, 0] - pose[c, 0])), pose[k, 1:] - pose[c, 1:]]) for c in chosen]
+        if all(o.max() > 0.05 for o in off):
+            chosen.append(int(k))
+    return chosen[:3]
+
+
+def _prepare(flattened: Flattened, config: Config) -> _Prepared:
+    main, *loose = flattened.pieces
+    return _Prepared(
+        flattened,
+        _near(evidence_from(flattened.outline, flattened.points, config.recognition)),
+        tuple(_ends(piece, config.contour) for piece in flattened.pieces),
+        tuple(_thin(piece.surface.uv) for piece in flattened.pieces),
+        main.surface.uv[:: max(1, len(main.surface.uv) // 3000)],
+        tuple(_hinges(main.surface, piece.surface, config.assembly) for piece in loose),
+    )
+
+
+def _near(main: Evidence) -> Evidence:
+    """Evidence of the main piece, which says nothing of what is farther off: other pieces come there."""
+    return replace(main, seen=np.where(main.distance < NEAR_M, main.seen, 0.0))
+
+
+def _trial(
+    prepared: _Prepared, template: Template, pose: Float, state: Float, config: Config
+) -> _Trial:
+    """Place the pieces under an outline."""
+    main, *loose = prepared.flattened.pieces
+    outline = place(template, pose, state)[0][: template.vertices]
+    turns, placed, cost = [_Turn(0.0, np.zeros(2), np.zeros(2))], [main], 0.0
+    for k, piece in enumerate(loose, start=1):
+        images = _images(placed, outline, piece)
+        hinges = prepared.hinges[k - 1]
+        turn, misfit = _best_turn(images, prepared.ends[k].uv, prepared.inner[k], hinges, config.assembly)
+        turns.append(turn)
+        placed.append(_moved(piece, turn, config.assembly))
+        cost += misfit
+    return _Trial(template, pose, state, tuple(turns), tuple(placed), cost, np.inf)
+
+
+def _alternate(prepared: _Prepared, trial: _Trial, config: Config, times: int) -> _Trial:
+    """Fit the outline to the placed pieces, and place them again."""
+    for _ in range(times):
+        evidence = _ends_evidence(prepared, prepared.main, trial.turns, config)
+        template = trial.template
+        poses, states, energy = refine(template, evidence, trial.pose[None], trial.state[None], CUTS)
+        trial = _trial(prepared, template, poses[0], states[0], config)
+        trial = replace(trial, energy=float(energy[0]))
+    return trial
+
+
+def _finished(prepared: _Prepared, trial: _Trial, config: Config) -> Assembly:
+    """The whole item, and how likely the category is with it."""
+    template = trial.template
+    union = united(trial.placed)
+    outline = trace_outline(union.surface, config.assembly.sigma_m, HALF_PIXEL_M, config.contour)
+    whole = replace(
+        prepared.flattened, points=union.points, start_uv=union.start_uv, pieces=(union,), outline=outline
+    )
+    evidence = evidence_from(outline, union.points, config.recognition)
+    evidence = _ends_evidence(prepared, evidence, trial.turns, config)
+    pose, state, energy = refine(template, evidence, trial.pose[None], trial.state[None], CUTS)
+    hessian = linearise(template, evidence, pose, state, CUTS[-1]).hessian[0]
+    prior = np.diag(np.r_[1e-6, 1e-6, 1e-6, np.ones(template.dimensions)])
+    occam = 0.5 * float(np.linalg.slogdet(hessian + prior)[1])
+    chance = -float(energy[0]) - occam - trial.cost
+    return Assembly(template, pose[0], state[0], evidence, whole, chance)
+
+
+def _ends_evidence(
+    prepared: _Prepared, union: Evidence, turns: Sequence[_Turn], config: Config
+) -> Evidence:
+    """What the fit of an outline rests on: the ends of every piece, also where they face another."""
+    ends, recognition = prepared.ends[: len(turns)], config.recognition
+    uv = np.vstack([turn(e.uv) for turn, e in zip(turns, ends, strict=True)])
+    normal = np.vstack([turn.direction(e.normal) for turn, e in zip(turns, ends, strict=True)])
+    sigma = [np.full(len(e.uv), 0.002 if k == 0 else config.assembly.sigma_m) for k, e in enumerate(ends)]
+    inner = np.vstack([turn(points) for turn, points in zip(turns, prepared.inner, strict=False)])
+    return replace(
+        union,
+        outline=uv,
+        normal=normal,
+        sigma=np.hypot(np.concatenate(sigma), recognition.misfit_m),
+        weight=np.concatenate([np.full(len(e.uv), union.density * e.spacing_m) for e in ends]),
+        inner=inner,
+        inner_sigma=np.full(len(inner), np.hypot(config.assembly.sigma_m, recognition.misfit_m)),
+        inner_weight=np.full(len(inner), 0.5 * prepared.main.total / len(inner)),
+        seen=_seen(union, uv),
+    )
+
+
+def _seen(union: Evidence, ends: Float) -> Float:
+    """Where the template's outline must lie on the seen one: not where two pieces' ends meet."""
+    cell = np.rint((ends - union.origin) / EVIDENCE_CELL_M).astype(int)
+    rows, cols = union.distance.shape
+    col, row = np.clip(cell, 0, [cols - 1, rows - 1]).T
+    within = union.distance[row, col] < -CELL_M
+    free = np.ones((rows, cols), np.uint8)
+    free[row[within], col[within]] = 0
+    away = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * EVIDENCE_CELL_M
+    return np.where(away < 0.06, 0.0, union.seen)
+
+
+def _best_turn(
+    images: _Images, ends: Float, inner: Float, hinges: _Hinges, config: AssemblyConfig
+) -> tuple[_Turn, float]:
+    """Best of all hinges and rotations, refined; and its cost beyond the ends' misfit."""
+    angle = np.arange(config.rotations) * (2 * np.pi / config.rotations)
+    trials = np.array([(a, *p, *q) for p, q in zip(hinges.there, hinges.here, strict=True) for a in angle])
+    costs = _costs(images, ends, inner, trials, np.zeros((len(trials), 2)), config).sum(axis=0)
+    best = int(costs.argmin())
+    cost, turn, shift = costs[best], trials[best], np.zeros(2)
+    step = np.array([np.pi / config.rotations, 0.02, 0.02])
+    ways = np.vstack([np.eye(3), -np.eye(3)])
+    while step[1] > 0.0005:
+        moves = ways * step
+        trials = np.column_stack([turn[:3] + moves, np.tile(turn[3:], (6, 1))])
+        costs = _costs(images, ends, inner, trials, (shift + moves[:, 1:]) / hinges.sigma_m, config).sum(axis=0)
+        best = int(costs.argmin())
+        if costs[best] < cost - 1e-9:
+            cost, turn, shift = costs[best], trials[best], shift + moves[best, 1:]
+        else:
+            step = step / 2
+    beside = _costs(images, ends, inner, turn[None], shift[None] / hinges.sigma_m, config)[1, 0]
+    return _Turn(float(turn[0]), turn[1:3], turn[3:]), float(beside)
+
+
+def _costs(
+    images: _Images, ends: Float, inner: Float, trials: Float, shift: Float, config: AssemblyConfig
+) -> Float:
+    """Misfits of (t, 5) trials (angle, fixed, moving), shifted from their hinges by (t, 2) sigmas.
+
+    Returns
+    -------
+    ndarray of shape (2, t)
+        To the outline (ends off it, cloth outside), and beside it (cloth on cloth, parted hinge).
+    """
+    sigma = config.misfit_m
+    inside = _all_turned(trials, inner)
+    off = _look_up(images, images.signed, _all_turned(trials, ends)) / sigma
+    out = np.maximum(_look_up(images, images.signed, inside), 0.0) / sigma
+    over = np.maximum(_look_up(images, images.taken, inside) - config.overlap_m, 0.0) / sigma
+    fit = config.end_weight * _soft(off, 3.0) + config.inner_weight * _soft(out, 3.0)
+    beside = config.overlap_weight * _soft(over, 6.0)
+    return np.stack([fit, beside + 0.5 * (shift**2).sum(axis=1)])
+
+
+def _all_turned(trials: Float, uv: Float) -> Float:
+    """(t, n, 2) places of (n, 2) points under (t, 5) trials."""
+    angle, fixed, moving = trials[:, 0], trials[:, 1:3], trials[:, 3:]
+    arm = (uv[None] - moving[:, None]) @ np.array([1.0, 1j]) * np.exp(1j * angle)[:, None]
+    return np.stack([arm.real, arm.imag], axis=-1) + fixed[:, None]
+
+
+def _soft(off: Float, cut: float) -> Float:
+    out: Float = (0.5 * off**2 / (1.0 + (off / cut) ** 2)).mean(axis=-1)
+    return out
+
+
+def _look_up(images: _Images, image: Float, uv: Float) -> Float:
+    at = np.rint((uv - images.low) / CELL_M).astype(np.int64)
+    rows, cols = image.shape
+    out: Float = image[np.clip(at[..., 1], 0, rows - 1), np.clip(at[..., 0], 0, cols - 1)]
+    return out
+
+
+def _images(placed: Sequence[FlatPiece], outline: Float, piece: FlatPiece) -> _Images:
+    taken = np.vstack([p.surface.uv for p in placed])
+    reach = float(np.linalg.norm(np.ptp(piece.surface.uv, axis=0)))
+    low = np.minimum(outline.min(axis=0), taken.min(axis=0)) - reach
+    high = np.maximum(outline.max(axis=0), taken.max(axis=0)) + reach
+    cols, rows = np.ceil((high - low) / CELL_M).astype(int) + 1
+    body, free = np.zeros((rows, cols), np.uint8), np.ones((rows, cols), np.uint8)
+    cv2.fillPoly(body, [np.rint((outline - low) / CELL_M).astype(np.int32)], (1,))
+    col, row = np.rint((taken - low) / CELL_M).astype(int).T
+    free[row, col] = 0
+    free = cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)).astype(np.uint8)
+
+    def depth(image: Float) -> Float:
+        return cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_5).astype(np.float64) * CELL_M
+
+    return _Images(low, depth(1 - body) - depth(body), depth(1 - free))
+
+
+def _hinges(main: FlatSurface, piece: FlatSurface, config: AssemblyConfig) -> _Hinges:
+    """Points about which the loose piece may be turned: the same point in both pieces' planes.
+
+    Where the pieces hang edge to edge, a fold between them is closed. Laid flat it opens about its
+    tip, which lies on the line along which they touch. The piece hangs from there, so the tip is as
+    high as the piece's upper end, or lower as far as the touching is seen.
+    """
+    distance, near = cKDTree(main.xyz_hanger).query(piece.xyz_hanger)
+    if distance.min() < config.joined_m:  # neighbouring pixels: this is the tip
+        k = int(distance.argmin())
+        return _Hinges(main.uv[near[[k]]], piece.uv[[k]], config.joined_m)
+    touching = np.flatnonzero(distance < distance.min() + config.touch_m)
+    p, q = main.uv[near[touching]], piece.uv[touching]
+    height = piece.xyz_hanger[touching, 2]
+    rise = height - height.mean()
+    top, highest = int(height.argmax()), float(piece.xyz_hanger[:, 2].max())
+    turn, shift = _rigid(p, q)
+    along = rise @ (p - p.mean(axis=0)) / max(float(rise @ rise), 1e-12)  # change of place with height
+    if np.ptp(height) < 2 * config.touch_m or len(touching) < 10:
+        along = np.zeros(2)
+    up = np.linspace(0.0, highest + config.touch_m - height[top], config.hinges)
+    there = p[top] + up[:, None] * along * min(1.0, 2.0 / max(float(np.linalg.norm(along)), 1e-9))
+    return _Hinges(there, (there - shift) @ turn, config.hinge_m)
+
+
+def _rigid(p: Float, q: Float) -> tuple[Float, Float]:
+    """Rotation and shift with p = rotation @ q + shift, robust."""
+    a, b = p @ np.array([1.0, 1j]), q @ np.array([1.0, 1j])
+    weight = np.ones(len(a))
+    turn, shift = 1.0 + 0j, 0j
+    for _ in range(6):
+        mean_a, mean_b = (weight @ a) / weight.sum(), (weight @ b) / weight.sum()
+        turn = (weight * (a - mean_a) * np.conj(b - mean_b)).sum() + 1e-12
+        turn /= abs(turn)
+        shift = mean_a - turn * mean_b
+        weight = 1.0 / (1.0 + (np.abs(a - turn * b - shift) / 0.02) ** 2) ** 2
+    rotation = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
+    return rotation, np.array([shift.real, shift.imag])
+
+
+def _ends(piece: FlatPiece, contour: ContourConfig) -> _Ends:
+    outline = trace_outline(piece.surface, 0.0, HALF_PIXEL_M, contour)
+    uv = outline.uv
+    along = np.roll(uv, -2, axis=0) - np.roll(uv, 2, axis=0)
+    normal = np.column_stack([along[:, 1], -along[:, 0]])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    keep = np.flatnonzero(~outline.inferred)
+    keep = keep if len(keep) > 3 else np.arange(len(uv))
+    some = keep[np.linspace(0, len(keep) - 1, min(len(keep), MOST)).astype(int)]
+    return _Ends(uv[some], normal[some], contour.spacing_m * len(keep) / len(some))
+
+
+def _thin(uv: Float) -> Float:
+    return uv[np.linspace(0, len(uv) - 1, min(len(uv), MOST)).astype(int)]
+
+
+def _moved(piece: FlatPiece, turn: _Turn, config: AssemblyConfig) -> FlatPiece:
+    points = replace(
+        piece.points,
+        uv=turn(piece.points.uv),
+        sigma_m=np.hypot(piece.points.sigma_m, config.sigma_m),
+    )
+    return FlatPiece(points, turn(piece.start_uv), replace(piece.surface, uv=turn(piece.surface.uv)))
+
+
+def united(pieces: Sequence[FlatPiece]) -> FlatPiece:
+    """Pieces in one plane as one."""
+    points, surfaces = [p.points for p in pieces], [p.surface for p in pieces]
+    shifts = np.cumsum([0, *(len(s.uv) for s in surfaces)])
+    return FlatPiece(
+        FlatPoints(
+            np.vstack([p.uv for p in points]),
+            np.vstack([p.xyz_hanger for p in points]),
+            np.concatenate([p.view_id for p in points]),
+            np.vstack([p.pixel for p in points]),
+            np.concatenate([p.sigma_m for p in points]),
+            np.concatenate([p.stress for p in points]),
+            np.concatenate([p.inferred for p in points]),
+        ),
+        np.vstack([p.start_uv for p in pieces]),
+        FlatSurface(
+            np.vstack([s.uv for s in surfaces]),
+            np.vstack([s.xyz_hanger for s in surfaces]),
+            np.concatenate([s.edge for s in surfaces]),
+            np.vstack([s.cells + shift for s, shift in zip(surfaces, shifts, strict=False)]),
+        ),
+    )

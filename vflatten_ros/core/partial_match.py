@@ -1,0 +1,131 @@
+"""Where on a category's outline a piece of an item may belong: chamfer matching over all shifts.
+
+For every rotation and size, the misfit of all shifts at once is a sum of correlations, by FFT: the
+piece's ends should lie on the outline, its cloth inside, and no part of the outline amid its cloth.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy import fft
+
+from vflatten_ros.core.templates import Template
+from vflatten_ros.core.values import Float
+
+CELL_M = 0.02
+CUT_M = 0.08  # farther off is no worse
+DEEP_M = 0.02  # cloth is this deep inside the piece before an outline there counts
+SIZES = (0.9, 1.1, 1.4)  # of the whole item's longest extent over the piece's
+ROTATIONS = 24
+
+
+def matches(
+    template: Template, ends: Float, inner: Float, count: int
+) -> tuple[Float, Float]:
+    """Best poses of typical cuts of a category for a piece of an item.
+
+    Parameters
+    ----------
+    template : Template
+    ends : ndarray of shape (n, 2)
+        Points of the piece's outline that may be ends of the item, m.
+    inner : ndarray of shape (q, 2)
+        Points spread over the piece.
+    count : int
+        Poses wanted.
+
+    Returns
+    -------
+    pose : ndarray of shape (count, 3)
+        Rotation and shift of the template.
+    state : ndarray of shape (count, m)
+    """
+    typical = template.outline(np.zeros(template.dimensions))
+    extent, own = _diameter(inner), _diameter(typical)
+    low = inner.min(axis=0) - SIZES[-1] * extent
+    span = np.ptp(inner, axis=0) + 2 * SIZES[-1] * extent
+    shape = tuple(fft.next_fast_len(int(n), real=True) for n in np.ceil(span / CELL_M)[::-1])
+    middle = np.array(shape)[::-1] * 0.5 * CELL_M
+    parts = [_spectrum(_histogram(ends, low, shape)), _spectrum(_histogram(inner, low, shape))]
+    parts.append(_spectrum(_depth(inner, low, shape)))
+    poses, states, costs = [], [], []
+    for size in SIZES:
+        state = _scaled(template, np.log(size * extent / own))
+        outline = template.outline(state)
+        centre = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
+        for angle in np.arange(ROTATIONS) * (2 * np.pi / ROTATIONS):
+            turned = (outline - centre) @ _rotation(angle).T
+            image = _misfit_of_shifts(turned + middle, shape, parts)
+            row, col = np.unravel_index(int(image.argmin()), shape)
+            shift = np.array([col, row], dtype=float)
+            size_cells = np.array(shape)[::-1]
+            shift = (shift + size_cells // 2) % size_cells - size_cells // 2
+            at = shift * CELL_M + middle + low
+            poses.append(np.r_[angle, at - _rotation(angle) @ centre])
+            states.append(state)
+            costs.append(image[row, col])
+    best = np.argsort(costs, kind="stable")[:count]
+    return np.array(poses)[best], np.array(states)[best]
+
+
+def _misfit_of_shifts(outline: Float, shape: tuple[int, ...], parts: list[Float]) -> Float:
+    """(rows, cols) misfit of the outline moved by every shift of the image."""
+    body = np.zeros(shape, dtype=np.uint8)
+    edge = np.zeros(shape, dtype=np.uint8)
+    cells = np.rint(outline / CELL_M * 16).astype(np.int32)
+    cv2.fillPoly(body, [cells], (1,), shift=4)
+    cv2.polylines(edge, [cells], isClosed=True, color=(1,), shift=4)
+    off = _capped(cv2.distanceTransform(1 - edge, cv2.DIST_L2, 3))
+    out = np.where(body > 0, 0.0, off)
+    total = np.conj(_spectrum(off)) * parts[0] + np.conj(_spectrum(out)) * parts[1]
+    total += np.conj(_spectrum(edge.astype(float) * 2.0 * CELL_M)) * parts[2]
+    image: Float = fft.irfft2(total, shape)
+    return image
+
+
+def _capped(distance: Float) -> Float:
+    return np.minimum(distance * CELL_M / CUT_M, 1.0) ** 2
+
+
+def _spectrum(image: Float) -> Float:
+    out: Float = fft.rfft2(image)
+    return out
+
+
+def _histogram(points: Float, low: Float, shape: tuple[int, ...]) -> Float:
+    """Share of the points in every cell."""
+    col, row = np.rint((points - low) / CELL_M).astype(int).T
+    image = np.zeros(shape)
+    np.add.at(image, (row, col), 1.0 / len(points))
+    return image
+
+
+def _depth(inner: Float, low: Float, shape: tuple[int, ...]) -> Float:
+    """How deep inside the piece every cell is, 0 to 1."""
+    free = np.ones(shape, dtype=np.uint8)
+    col, row = np.rint((inner - low) / CELL_M).astype(int).T
+    free[row, col] = 0
+    free = cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(np.uint8)
+    deep = cv2.distanceTransform(1 - free, cv2.DIST_L2, 3) * CELL_M - DEEP_M
+    out: Float = np.clip(deep / CUT_M, 0.0, 1.0)
+    return out
+
+
+def _scaled(template: Template, log_size: float) -> Float:
+    """The typical cut, larger or smaller as a whole."""
+    roots = np.abs(template.log_spread).astype(bool).sum(axis=1) == 1
+    state = np.zeros(template.dimensions)
+    spread = np.diagonal(template.log_spread)[roots]
+    state[: len(template.sizes)][roots] = log_size / spread
+    return state
+
+
+def _diameter(points: Float) -> float:
+    middle = points.mean(axis=0)
+    return 2.0 * float(np.linalg.norm(points - middle, axis=1).max())
+
+
+def _rotation(angle: float) -> Float:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]])

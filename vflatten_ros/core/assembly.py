@@ -29,6 +29,8 @@ from vflatten_ros.core.values import (
     FlatSurface,
     Flattened,
     Float,
+    Progress,
+    no_progress,
 )
 
 MOST = 100  # points of a piece's ends, and of its inside, that are judged
@@ -112,6 +114,16 @@ class _Prepared:
 
 
 @dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A category's outline, fitted to the main piece."""
+
+    template: Template
+    pose: Float
+    state: Float
+    energy: float
+
+
+@dataclass(frozen=True, eq=False)
 class _Trial:
     """A category's outline and the places of the pieces, on the way to an assembly."""
 
@@ -124,7 +136,12 @@ class _Trial:
     energy: float  # of the outline's fit
 
 
-def assemble(flattened: Flattened, templates: Sequence[Template], config: Config) -> list[Assembly]:
+def assemble(
+    flattened: Flattened,
+    templates: Sequence[Template],
+    config: Config,
+    progress: Progress = no_progress,
+) -> list[Assembly]:
     """Place the loose pieces as categories have them, and fit the categories to all pieces, in turns.
 
     Parameters
@@ -133,6 +150,7 @@ def assemble(flattened: Flattened, templates: Sequence[Template], config: Config
         With its pieces; the main one, which is the first, stays where it is.
     templates : sequence of Template
     config : Config
+    progress : Progress
 
     Returns
     -------
@@ -140,20 +158,26 @@ def assemble(flattened: Flattened, templates: Sequence[Template], config: Config
         For the likeliest categories, best first.
     """
     prepared = _prepare(flattened, config)
-    kept = []
-    for template in map(_stiff, templates):
-        fits = _first_fits(prepared, template, config)
-        trials = [
-            _alternate(prepared, _trial(prepared, template, pose, state, config), config, 1)
-            for pose, state in fits
-        ]
-        kept.append(min(trials, key=lambda t: t.energy + t.cost))
-    kept.sort(key=lambda t: t.energy + t.cost)
-    best = [
-        _alternate(prepared, t, config, config.assembly.alternations)
-        for t in kept[: config.assembly.categories]
-    ]
-    return sorted((_finished(prepared, t, config) for t in best), key=lambda a: -a.chance)
+    fits = []
+    for done, template in enumerate(map(_stiff, templates)):
+        progress("recognition", 0.4 * done / len(templates))
+        fits += _first_fits(prepared, template, config)
+    least = min(fit.energy for fit in fits)
+    kept: dict[str, _Trial] = {}
+    for done, fit in enumerate(f for f in fits if f.energy < least + config.assembly.hopeless):
+        progress("recognition", 0.4 + 0.2 * done / len(fits))
+        trial = _trial(prepared, fit.template, fit.pose, fit.state, config)
+        trial = _alternate(prepared, trial, config, 1)
+        name = fit.template.category
+        if name not in kept or trial.energy + trial.cost < kept[name].energy + kept[name].cost:
+            kept[name] = trial
+    likely = sorted(kept.values(), key=lambda t: t.energy + t.cost)[: config.assembly.categories]
+    found = []
+    for done, trial in enumerate(likely):
+        progress("recognition", 0.6 + 0.4 * done / len(likely))
+        trial = _alternate(prepared, trial, config, config.assembly.alternations - 1)
+        found.append(_finished(prepared, trial, config))
+    return sorted(found, key=lambda a: -a.chance)
 
 
 def _stiff(template: Template) -> Template:
@@ -161,15 +185,13 @@ def _stiff(template: Template) -> Template:
     return replace(template, swing=STIFF * template.swing)
 
 
-def _first_fits(
-    prepared: _Prepared, template: Template, config: Config
-) -> list[tuple[Float, Float]]:
+def _first_fits(prepared: _Prepared, template: Template, config: Config) -> list[_Fitted]:
     """Poses and cuts of an outline of which the main piece may be a part only."""
     still = _Turn(0.0, np.zeros(2), np.zeros(2))
     evidence = _ends_evidence(prepared, prepared.main, (still,), config)
     pose, state = matches(template, prepared.ends[0].uv, prepared.whole_inner, MOST_FITS)
     pose, state, energy = refine(template, evidence, pose, state, COARSE + CUTS)
-    return [(pose[k], state[k]) for k in _distinct(pose, energy)]
+    return [_Fitted(template, pose[k], state[k], float(energy[k])) for k in _distinct(pose, energy)]
 
 
 def _distinct(pose: Float, energy: Float) -> list[int]:

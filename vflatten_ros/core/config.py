@@ -290,6 +290,9 @@ class AssemblyConfig(Checked):
     categories: int = option(
         3, "Likeliest categories for which pieces are placed with care.", low=1, high=100
     )
+    hopeless: float = option(
+        15.0, "Outlines that fit the main piece worse than the best by this, in sigma squared halves, are dropped.", low=0.0, high=1000.0
+    )
     alternations: int = option(
         4, "Times that pieces are placed and the outline is fitted, in turns; 0: not.", low=0, high=100
     )

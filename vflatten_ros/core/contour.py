@@ -46,6 +46,8 @@ def trace_outline(surface: FlatSurface, sigma_m: float, margin_m: float, config:
     low = uv.min(axis=0) - reach
     shape = tuple(np.ceil((uv.max(axis=0) + reach - low) / config.cell_m).astype(int)[::-1] + 1)
     image = _filled(uv[surface.cells], low, shape, config.cell_m)
+    col, row = np.rint((uv - low) / config.cell_m).astype(int).T
+    image[row, col] = True  # points beside holes, that have no square of their own
     image = _closed(image, config.close_m / config.cell_m)
     image = _bridged(image, uv, edge, low, config)
     contour = _largest(image)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from vflatten_ros.core.config import Config
@@ -25,7 +26,9 @@ class Observation:
     place: Int  # (n, 2) row and column of every point on the grid of rays
     patch: Int  # (n,) smooth patch, largest first; -1: none
     fringe: Int  # (n,) the same with the points between patches
-    edge: Bool  # (n,) the item may end at this point; False: it goes on unseen
+    depth: Float  # (n,) along the rays, m
+    facing: Float  # (n,) cosine of the angle between the normal and the direction to the camera
+    ends: Int  # (e, 2) points at an end of what is seen; the next point beyond, -1: none near
 
 
 def observe(view: View, config: Config, progress: Progress) -> Observation:
@@ -42,8 +45,40 @@ def observe(view: View, config: Config, progress: Progress) -> Observation:
     found = find_patches(cells, depth[first], config.patches)
     cell = cell.reshape(-1)
     facing = np.einsum("ij,ij->i", surface.normals, toward)
-    edge = ~found.hidden[cell] & (facing > GRAZING)
-    return Observation(view, surface, place, found.patch[cell], found.fringe[cell], edge)
+    ends = np.where(found.ends >= 0, first[found.ends], -1)
+    return Observation(
+        view, surface, place, found.patch[cell], found.fringe[cell], depth, facing, ends
+    )
+
+
+def edges(observation: Observation, uv: Float, step_m: float) -> Bool:
+    """Points at which the item may end, once they are flattened; elsewhere it goes on unseen.
+
+    At an end of what is seen, the next cloth in the image tells: if it lies as far away in the plane as
+    in space, it is the far side of a hole in the data; if it is as near to the camera or nearer, and
+    lies elsewhere in the plane, it hides how the cloth goes on; otherwise the item may end there. Cloth
+    that turns away from the camera goes on, too.
+
+    Parameters
+    ----------
+    observation : Observation
+    uv : ndarray of shape (n, 2)
+        Flat places of its points, m; nan: elsewhere.
+    step_m : float
+        Cloth nearer in depth than this is as near.
+    """
+    i, j = observation.ends.T
+    points, depth = observation.surface.points, observation.depth
+    space = np.linalg.norm(points[i] - points[j], axis=1)
+    flat = np.linalg.norm(uv[i] - uv[j], axis=1)
+    hole = (j >= 0) & (flat < 1.5 * space + 0.004)  # False where either is nan
+    before = (j >= 0) & ~hole & (depth[j] < depth[i] + step_m)
+    balance = np.zeros(observation.place.max(axis=0) + 1)
+    np.add.at(balance, tuple(observation.place[i].T), np.where(hole, 0.0, np.where(before, 1.0, -1.0)))
+    # the outline is ragged: single pixels face their neighbours along it
+    around = cv2.boxFilter(balance, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    hidden = around[tuple(observation.place.T)] > 0.5
+    return ~hidden & (observation.facing > GRAZING)
 
 
 def _camera(view: View) -> Float:

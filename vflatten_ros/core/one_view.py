@@ -11,7 +11,7 @@ from vflatten_ros.core.config import Config
 from vflatten_ros.core.contour import trace_outline
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.geodesics import geodesic_lines
-from vflatten_ros.core.observation import Observation, observe, quads
+from vflatten_ros.core.observation import Observation, edges, observe, quads
 from vflatten_ros.core.patch_flattening import flatten_patch
 from vflatten_ros.core.sampling import thinned
 from vflatten_ros.core.surface import Surface
@@ -64,7 +64,7 @@ def flatten_one_view(view: View, config: Config, progress: Progress = no_progres
     ]
     lines = _lines(observation, main, config, progress)
     progress("outline", 0.0)
-    surface = _surface(observation, main, uv)
+    surface = _surface(observation, main, uv, config.patches.step_m)
     outline = trace_outline(
         surface, POINT_SIGMA_M, 0.5 * observation.surface.spacing_m, config.contour
     )
@@ -118,11 +118,13 @@ def _turned_to(uv: Float, xy: Float) -> Float:
     return turned
 
 
-def _surface(observation: Observation, main: Bool, uv: Float) -> FlatSurface:
+def _surface(observation: Observation, main: Bool, uv: Float, step_m: float) -> FlatSurface:
     number = np.full(len(main), -1, dtype=np.int64)
     number[main] = np.arange(main.sum())
     cells = number[quads(observation, main)]
-    return FlatSurface(uv[main], observation.surface.points[main], observation.edge[main], cells)
+    flat = np.where(main[:, None], uv, np.nan)
+    edge = edges(observation, flat, step_m)[main]
+    return FlatSurface(uv[main], observation.surface.points[main], edge, cells)
 
 
 def _lines(

@@ -40,8 +40,7 @@ class Patches:
 
     patch: Int  # (n,) number of the point's patch, largest first; -1: beside a step, or patch too small
     fringe: Int  # (n,) the same with the points between patches, which may be of the one or the other
-    hidden: Bool  # (n,) an end of what is seen that need not be an end of the cloth: more of the item,
-    # as near or nearer, lies just beyond
+    ends: Int  # (e, 2) points at an end of what is seen; the next point beyond, -1: none near
 
 
 def find_patches(place: Int, depth: Float, config: PatchConfig) -> Patches:
@@ -72,7 +71,7 @@ def find_patches(place: Int, depth: Float, config: PatchConfig) -> Patches:
     patch = _components(links[core[links].all(axis=1)], core, config.min_points)
     patch = _grown(patch, links, config.margin_px + 2)
     fringe = _grown(patch, links, config.gap_px)
-    return Patches(patch, fringe, _hidden(index, borders, depth, config))
+    return Patches(patch, fringe, _ends(index, borders, config.gap_px))
 
 
 def _borders(index: Int, depth: Float, config: PatchConfig) -> list[_Borders]:
@@ -163,35 +162,24 @@ def _grown(patch: Int, links: Int, rounds: int) -> Int:
     return patch
 
 
-def _hidden(index: Int, borders: list[_Borders], depth: Float, config: PatchConfig) -> Bool:
-    """Points at an end of what is seen, beyond which lies cloth as near or nearer to the camera.
-
-    The next measured pixel beyond the end counts, if it is not too far away in the image.
-    """
+def _ends(index: Int, borders: list[_Borders], reach: int) -> Int:
+    """(e, 2) points that are not joined to the next pixel, and the next measured point that way."""
     right, down = (np.zeros(index.shape, dtype=bool) for _ in range(2))
     right[borders[0].first] = borders[0].open
     down[borders[1].first] = borders[1].open
-    known = index >= 0
-    z = np.where(known, depth[index], np.inf)
-    balance = np.zeros(index.shape)  # ends before more cloth, less those before nothing
+    found = []
     for axis, way, joined in ((1, 1, right), (1, -1, right), (0, 1, down), (0, -1, down)):
         joined = joined if way > 0 else _beyond(joined, axis, -1, False)
-        end = known & ~joined
-        waiting = end.copy()
-        for step in range(1, config.gap_px + 1):
-            other = _beyond(z, axis, step * way, np.inf)
-            found = waiting & np.isfinite(other)
-            balance += 2.0 * (found & (other < z + config.step_m))
-            waiting &= ~found
-        balance -= end
-    # the outline is ragged: single pixels face their neighbours along it
-    around = cv2.boxFilter(balance, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    hidden = np.zeros(len(depth), dtype=bool)
-    hidden[index[known]] = around[known] > 0.5
-    return hidden
+        end = (index >= 0) & ~joined
+        next_one = np.full(index.shape, -1, dtype=np.int64)
+        for step in range(1, reach + 1):
+            other = _beyond(index, axis, step * way, -1)
+            next_one = np.where(next_one < 0, other, next_one)
+        found.append(np.stack([index[end], next_one[end]], axis=1))
+    return np.concatenate(found)
 
 
-def _beyond(image: NDArray[Any], axis: int, by: int, outside: float) -> NDArray[Any]:
+def _beyond(image: NDArray[Any], axis: int, by: int, outside: int) -> NDArray[Any]:
     """The image's value so many pixels further along the axis."""
     moved = np.roll(image, -by, axis=axis)
     lost = slice(-by, None) if by > 0 else slice(None, -by)

@@ -12,7 +12,8 @@ from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface, NotEnoughViews
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.one_view import flatten_one_view
-from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
+from vflatten_ros.core.model_images import model_image_scores
+from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, recognise
 from vflatten_ros.core.recognition import _finish as finish
 from vflatten_ros.core.rotation import Unfolded, turn_parts, unfold_views, unfold_without_necks
 from vflatten_ros.core.template_fit import place
@@ -197,25 +198,32 @@ def _recognised(
     flattened: Flattened, templates: tuple[Template, ...], config: Config, progress: Progress
 ) -> tuple[Flattened, Recognition]:
     """Category of the item; loose pieces are placed as the likeliest categories have them."""
-    found = recognise(flattened.outline, flattened.points, templates, config.recognition)
-    if len(flattened.pieces) < 2 or not config.assembly.alternations:
-        return flattened, found
-    progress("recognition", 0.4)
-    tried = assemble(flattened, templates, config)
+    if not flattened.pieces or not config.assembly.alternations:
+        return flattened, recognise(
+            flattened.outline, flattened.points, templates, config.recognition
+        )
+    tried = assemble(flattened, templates, config, progress)
     best = tried[0]
-    whole = best.flattened
-    again = recognise(whole.outline, whole.points, templates, config.recognition)
     fit = finish(best.template, best.evidence, best.pose[None], best.state[None])
-    odds = np.exp(np.array([t.chance for t in tried]) - best.chance)
-    shares = {t.template.category: float(o / odds.sum()) for t, o in zip(tried, odds, strict=True)}
+    unknown = -FREEDOM - config.recognition.unknown_misfit * 2.0 * best.evidence.total
+    odds = {t.template.category: np.exp(t.chance - best.chance) for t in tried}
+    odds[UNKNOWN] = np.exp(unknown - best.chance)
+    everything = sum(odds.values())
+    names = [*(t.category for t in templates), UNKNOWN]
     near = np.maximum(fit.edge_seen[:, 0], np.roll(fit.edge_seen[:, -1], 1))
-    count = best.template.vertices
-    return whole, Recognition(
-        category=best.template.category,
-        scores=again.scores,
-        probabilities={**dict.fromkeys(again.probabilities, 0.0), **shares},
+    known = odds[UNKNOWN] < 1.0
+    count = best.template.vertices if known else 0
+    return best.flattened, Recognition(
+        category=best.template.category if known else UNKNOWN,
+        scores=model_image_scores(
+            best.flattened.outline.uv,
+            templates,
+            config.recognition.decay,
+            config.recognition.model_rotations,
+        ),
+        probabilities={name: float(odds.get(name, 0.0) / everything) for name in names},
         fit=fit,
         template_uv=fit.points()[:count],
         template_seen=near[:count] > 0.5,
-        fits={**again.fits, best.template.category: fit},
+        fits={best.template.category: fit},
     )

@@ -41,7 +41,7 @@ from vflatten_ros.core.integration import (
     start_places,
     unknowns,
 )
-from vflatten_ros.core.observation import Observation, locate, observe, quads
+from vflatten_ros.core.observation import Observation, edges, locate, observe, quads
 from vflatten_ros.core.sampling import thinned
 from vflatten_ros.core.unrolling import Complex, Relations, carry, frames_of, unroll
 from vflatten_ros.core.values import (
@@ -65,7 +65,7 @@ from vflatten_ros.core.values import (
 LINES_PER_POINT = 3  # geodesic lines that start at a boundary point
 POINT_SIGMA_M = 0.002  # of a flattened point, whatever its stress
 MISFIT_M = 0.003  # of neighbours, beyond which they lose their say when unrolled
-FEWEST_SAMPLES = 40  # of a piece that is worth placing
+SMALLEST = 0.05  # share of the main piece's samples that makes a piece worth placing
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ def _pieces_to_place(joint: Joint, count_a: int, pairs: int) -> list[int]:
         )
     marked = np.r_[joint.piece[:pairs], joint.piece[count_a : count_a + pairs]]
     size = np.bincount(joint.piece)
-    return [0, *(int(p) for p in np.unique(marked) if p > 0 and size[p] >= FEWEST_SAMPLES)]
+    return [0, *(int(p) for p in np.unique(marked) if p > 0 and size[p] >= SMALLEST * size[0])]
 
 
 def _piece(
@@ -364,7 +364,10 @@ def _dense(
         number = np.full(len(points), -1, dtype=np.int64)
         number[keep] = shift + np.arange(keep.sum())
         cells = number[quads(observation, keep)]
-        parts.append(FlatSurface(placed, points[keep], observation.edge[keep], cells))
+        flat = np.full((len(points), 2), np.nan)
+        flat[keep] = placed
+        edge = edges(observation, flat, config.patches.step_m)[keep]
+        parts.append(FlatSurface(placed, points[keep], edge, cells))
         shift += int(keep.sum())
     return FlatSurface(
         np.concatenate([p.uv for p in parts]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,6 +18,8 @@ CELL_M = 0.004  # of the images
 MARGIN_M = 0.15  # of the images round the outline
 SAMPLES = 128  # of the outline, and most flattened points that a fit uses
 RIM_M = 0.03  # flattened points nearer than this to the outline, or outside, bound the item
+MOST_INFERRED = 0.6  # if more than this is, the flags say too little to go by
+GAP_WEIGHT = 2.5  # of a gap between points that are seen on both sides of it
 MOST_LINKED = 6000  # flattened points that are linked to find gaps
 
 
@@ -37,6 +39,19 @@ class Evidence:
     slope: Float  # (rows, cols, 2) its gradient
     seen: Float  # (rows, cols) 1 where the nearest part of the outline was seen
     density: float  # independent observations per metre of outline
+
+    def thinned(self) -> Evidence:
+        """Every second point of the outline and no inner points, for a first look."""
+        return replace(
+            self,
+            outline=self.outline[::2],
+            normal=self.normal[::2],
+            sigma=self.sigma[::2],
+            weight=2.0 * self.weight[::2],
+            inner=self.inner[:0],
+            inner_sigma=self.inner_sigma[:0],
+            inner_weight=self.inner_weight[:0],
+        )
 
     @property
     def total(self) -> float:
@@ -63,6 +78,9 @@ def evidence_from(outline: Outline, points: FlatPoints, config: RecognitionConfi
     gaps = _gaps(points, origin, body)
     even = _evenly(_with_gaps(outline, origin, body, gaps), SAMPLES)
     uv, sigma, inferred = even.uv, even.sigma_m, even.inferred
+    if inferred.mean() > MOST_INFERRED:
+        sigma = np.full(SAMPLES, np.median(points.sigma_m))
+        inferred = np.zeros(SAMPLES, dtype=bool)
     distance, slope, seen = _distance_image(uv, ~inferred, origin, (rows, cols))
     density = 0.5 / config.correlation_m
     weight = density * float(np.linalg.norm(uv[1] - uv[0]))
@@ -73,7 +91,7 @@ def evidence_from(outline: Outline, points: FlatPoints, config: RecognitionConfi
         outline=uv,
         normal=_normals(uv),
         sigma=np.hypot(sigma, config.misfit_m),
-        weight=np.where(inferred, 0.0, weight),
+        weight=np.where(inferred, 0.0, weight) * np.where(_opened(uv, outline), GAP_WEIGHT, 1.0),
         inner=points.uv[rim],
         inner_sigma=np.hypot(points.sigma_m[rim], config.misfit_m),
         inner_weight=np.full(len(rim), 0.5 * weight * SAMPLES / max(len(rim), 1)),
@@ -142,6 +160,12 @@ def _with_gaps(
     far, near = cKDTree(given.uv).query(uv)
     uv = np.where((far < 0.01)[:, None], given.uv[near], uv)
     return Outline(uv, given.sigma_m[near], given.inferred[near] & (far < 0.02))
+
+
+def _opened(uv: Float, outline: Outline) -> Bool:
+    """Points that go along an opened gap rather than along the outline that was given."""
+    far: Bool = cKDTree(_evenly(outline, 8 * SAMPLES).uv).query(uv)[0] > 0.01
+    return far
 
 
 def _evenly(outline: Outline, count: int) -> Outline:

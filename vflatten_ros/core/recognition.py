@@ -25,6 +25,7 @@ from vflatten_ros.core.values import Bool, FlatPoints, Outline
 
 UNKNOWN = "unknown"
 BEST = 5  # hypotheses of a category that are refined to the end
+FREEDOM = 25.0  # of an ordinary category: what its pose and sizes cost in evidence
 COARSE = (12.0, 9.0, 6.0, 6.0)  # where residuals level off, in sigmas, for every step
 FINE = (5.0, 4.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0)
 LAST = (3.0, 3.0, 3.0, 3.0, 3.0)
@@ -95,7 +96,7 @@ def recognise(
 def fit_template(template: Template, evidence: Evidence, config: RecognitionConfig) -> Fit:
     """The best pose and cut of one category."""
     pose, state = starts(template, evidence, config.fit_rotations)
-    pose, state, energy = refine(template, evidence, pose, state, COARSE)
+    pose, state, energy = refine(template, evidence.thinned(), pose, state, COARSE)
     first = np.argsort(energy, kind="stable")[:BEST]
     pose, state, energy = refine(template, evidence, pose[first], state[first], FINE)
     best = energy.argmin()
@@ -103,14 +104,14 @@ def fit_template(template: Template, evidence: Evidence, config: RecognitionConf
 
 
 def _finish(template: Template, evidence: Evidence, pose: Float, state: Float) -> Fit:
-    """Evidence under the errors that were expected; sizes under those that were found."""
-    prior = np.r_[1e-6, 1e-6, 1e-6, np.ones(template.dimensions)]
-    system = linearise(template, evidence, pose, state, FINE[-1])
-    energy = float(system.energy[0]) + 0.5 * float((state**2).sum())
-    occam = 0.5 * float(np.linalg.slogdet(system.hessian[0] + np.diag(prior))[1])
+    """The fit under the errors that were found, and how well it explains what was seen."""
+    prior = np.diag(np.r_[1e-6, 1e-6, 1e-6, np.ones(template.dimensions)])
     scale = _spread(evidence, template, pose[0], state[0])
     pose, state, _ = refine(template, evidence, pose, state, LAST, scale)
-    hessian = linearise(template, evidence, pose, state, scale * LAST[-1]).hessian[0]
+    system = linearise(template, evidence, pose, state, scale * LAST[-1])
+    hessian = system.hessian[0] / scale**2 + prior
+    energy = float(system.energy[0]) / scale**2 + 2.0 * evidence.total * np.log(scale)
+    freedom = 0.5 * float((state**2).sum()) + 0.5 * float(np.linalg.slogdet(hessian)[1])
     outline = place(template, pose[0], state[0])[0][: template.vertices]
     distance, seen = _edge_distances(evidence, outline)
     on = np.abs(distance) < 3.0 * float(np.median(evidence.sigma))
@@ -120,9 +121,9 @@ def _finish(template: Template, evidence: Evidence, pose: Float, state: Float) -
         template=template,
         pose=pose[0],
         state=state[0],
-        covariance=np.linalg.inv(hessian / scale**2 + np.diag(prior)),
-        energy=energy,
-        evidence=-energy - occam,
+        covariance=np.linalg.inv(hessian),
+        evidence=-energy - freedom,
+        misfit=energy / max(2.0 * evidence.total, 1e-9),
         residual_m=scale * float(np.median(evidence.sigma)),
         explained=float((residual < 3.0).mean()) if trusted.any() else 0.0,
         edge_seen=(on & (seen > 0)).astype(float),
@@ -150,8 +151,8 @@ def _probabilities(
     fits: Mapping[str, Fit], evidence: Evidence, config: RecognitionConfig
 ) -> dict[str, float]:
     names = [*fits, UNKNOWN]
+    observations = 2.0 * evidence.total
     logs = [fit.evidence for fit in fits.values()]
-    freedom = 20.0  # cost of the freedom of an ordinary category: 0.5 log det
-    logs.append(-freedom - config.unknown_misfit * 2.0 * evidence.total)
+    logs.append(-FREEDOM - config.unknown_misfit * observations)
     value = np.exp(np.array(logs) - max(logs))
     return dict(zip(names, (value / value.sum()).tolist()))

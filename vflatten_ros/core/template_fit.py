@@ -32,8 +32,8 @@ class Fit:
     pose: Float  # (3,) rotation rad, u, v of the template in the flat frame
     state: Float  # (m,) of the template
     covariance: Float  # (3 + m, 3 + m) of pose and state
-    energy: float  # negative logarithm of the posterior, up to a constant
-    evidence: float  # logarithm of the evidence, up to the same constant
+    evidence: float  # logarithm of the probability of what was seen, up to a constant
+    misfit: float  # what an independent observation costs, on average
     residual_m: float  # robust rms distance of the seen outline
     explained: float  # 0-1, share of the seen outline that lies on the template's
     edge_seen: Float  # (e, s) 0-1: how well each sample of each template edge is seen

@@ -353,7 +353,10 @@ def flattening(quick: bool, seeds: int) -> tuple[dict[str, Any], list[str]]:
 def flat_ours(patch: Patch, points: Float) -> Float:
     surface = fit(patch, points)
     place = np.round(surface.rays.to_grid(points)[0]).astype(int)
-    return flatten_patch(surface).uv[place[:, 0], place[:, 1]]
+    flat = flatten_patch(surface)
+    uv = flat.uv[place[:, 0], place[:, 1]]
+    # the largest piece, as of the meshes: others have a position of their own
+    return np.where(flat.piece[place[:, 0], place[:, 1]][:, None] == 0, uv, np.nan)
 
 
 def flat_arap(patch: Patch, points: Float) -> Float:

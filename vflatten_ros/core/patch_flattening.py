@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, identity
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from vflatten_ros.core.surface import Surface
@@ -31,7 +32,7 @@ class FlatPatch:
     """The grid places of a surface in the plane; each piece has a position of its own."""
 
     uv: Float  # (rows, cols, 2) metres, nan where there is no surface
-    piece: NDArray[np.int32]  # (rows, cols) number of the piece, -1: none
+    piece: NDArray[np.int32]  # (rows, cols) number of the piece, largest first; -1: none
     strain: Float  # (rows, cols) rms misfit of the steps to the neighbours, relative
 
 
@@ -76,7 +77,7 @@ def flatten_patch(surface: Surface) -> FlatPatch:
             both = (np.concatenate([e, o[agree]]) for e, o in zip(edges, over))
             edges = (next(both), next(both))
             place, turn = _solve(_steps(points, frames, *edges), sure, len(rows))
-    return _on_grid(used, layers.label, rows, cols, place, _steps(points, frames, *edges))
+    return _on_grid(used, rows, cols, place, _steps(points, frames, *edges))
 
 
 def _edges(number: Int, right: Bool, down: Bool) -> tuple[Int, Int]:
@@ -182,7 +183,6 @@ def _turns(place: Complex, steps: _Steps, weight: Float, turn: Float) -> Float:
 
 def _on_grid(
     used: Bool,
-    label: NDArray[np.int32],
     rows: Int,
     cols: Int,
     place: Complex,
@@ -196,4 +196,14 @@ def _on_grid(
     edges = np.bincount(a, minlength=count) + np.bincount(b, minlength=count)
     strain = np.zeros(used.shape)
     strain[rows, cols] = np.sqrt(total / np.maximum(edges, 1))
-    return FlatPatch(uv, np.where(used, label, -1).astype(np.int32), strain)
+    piece = np.full(used.shape, -1, np.int32)
+    piece[rows, cols] = _pieces(a, b, count)
+    return FlatPatch(uv, piece, strain)
+
+
+def _pieces(a: Int, b: Int, count: int) -> Int:
+    """(k,) which places hang together, the largest piece first."""
+    graph = csr_matrix((np.ones(len(a)), (a, b)), shape=(count, count))
+    label = connected_components(graph, directed=False)[1]
+    order = np.argsort(-np.bincount(label), kind="stable")
+    return np.asarray(np.argsort(order, kind="stable")[label])

@@ -125,7 +125,7 @@ NOISES = [(0.0, 0.0), (0.001, 0.0), (0.002, 0.0), (0.001, 1.3)]  # sigma, m; cor
 
 def geodesics(quick: bool, seeds: int) -> tuple[dict[str, Any], list[str]]:
     """Errors of lines with independent and correlated noise."""
-    noises = NOISES[1:3] if quick else NOISES
+    noises = NOISES[1:2] if quick else NOISES
     p95: dict[str, dict[tuple[str, float], float]] = {name: {} for name in MAIN}
     bias: dict[str, float] = {}
     lines = []

@@ -52,8 +52,18 @@ def generate_launch_description() -> LaunchDescription:
             Node(  # where RViz draws the flat contour: beside the item, u right, v up
                 package="tf2_ros",
                 executable="static_transform_publisher",
-                arguments=["--x", "0.9", "--z", "1.3", "--roll", "3.141593",
-                           "--frame-id", "rig_optical", "--child-frame-id", "garment_flat"],
+                arguments=[
+                    "--x",
+                    "0.9",
+                    "--z",
+                    "1.3",
+                    "--roll",
+                    "3.141593",
+                    "--frame-id",
+                    "rig_optical",
+                    "--child-frame-id",
+                    "garment_flat",
+                ],
                 condition=IfCondition(LaunchConfiguration("rviz")),
             ),
         ]

@@ -40,6 +40,7 @@ MOST_FITS = 8  # fits of a category that are refined
 STIFF = 0.05  # of the swing that is allowed where paths along the cloth are uncertain
 NEAR_M = 0.02  # beyond the main piece's outline
 CUTS = (6.0, 5.0, 4.0, 3.0, 3.0, 3.0)  # of the fits of the outline, in sigmas
+USUALLY_HIDDEN, HIDDEN_SPREAD = 0.15, 0.15  # share of an item that two well-chosen views leave out
 HALF_PIXEL_M = 0.00125  # cloth reaches beyond the centres of its outermost pixels
 
 
@@ -84,12 +85,15 @@ class _Turn:
     def __call__(self, uv: Float) -> Float:
         return self.direction(uv - self.moving) + self.fixed
 
+    def by(self, step: Float) -> _Turn:
+        """Turned by an angle about the middle of the motion, and shifted."""
+        return _Turn(self.angle + step[0], self.fixed + step[1:], self.moving)
+
     def direction(self, vector: Float) -> Float:
         """Turn directions."""
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         out: Float = vector @ np.array([[cos, sin], [-sin, cos]])
         return out
-
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +180,10 @@ def assemble(
     for done, trial in enumerate(likely):
         progress("recognition", 0.6 + 0.4 * done / len(likely))
         trial = _alternate(prepared, trial, config, config.assembly.alternations - 1)
-        found.append(_finished(prepared, trial, config))
-    return sorted(found, key=lambda a: -a.chance)
+        found.append((_finished(prepared, trial, config), trial))
+    found.sort(key=lambda pair: -pair[0].chance)
+    best = _finished(prepared, _polished(prepared, found[0][1], config), config)
+    return [best, *(assembly for assembly, _ in found[1:])]
 
 
 def _stiff(template: Template) -> Template:
@@ -198,7 +204,10 @@ def _distinct(pose: Float, energy: Float) -> list[int]:
     """The best of each group of alike poses, three at most."""
     chosen: list[int] = []
     for k in np.argsort(energy, kind="stable"):
-        off = [np.abs(np.r_[np.sin(0.5 * (pose[k, 0] - pose[c, 0])), pose[k, 1:] - pose[c, 1:]]) for c in chosen]
+        off = [
+            np.abs(np.r_[np.sin(0.5 * (pose[k, 0] - pose[c, 0])), pose[k, 1:] - pose[c, 1:]])
+            for c in chosen
+        ]
         if all(o.max() > 0.05 for o in off):
             chosen.append(int(k))
     return chosen[:3]
@@ -222,16 +231,24 @@ def _near(main: Evidence) -> Evidence:
 
 
 def _trial(
-    prepared: _Prepared, template: Template, pose: Float, state: Float, config: Config
+    prepared: _Prepared,
+    template: Template,
+    pose: Float,
+    state: Float,
+    config: Config,
+    before: Sequence[_Turn] = (),
 ) -> _Trial:
-    """Place the pieces under an outline."""
+    """Place the pieces under an outline: anywhere, or near where they were."""
     main, *loose = prepared.flattened.pieces
     outline = place(template, pose, state)[0][: template.vertices]
     turns, placed, cost = [_Turn(0.0, np.zeros(2), np.zeros(2))], [main], 0.0
     for k, piece in enumerate(loose, start=1):
         images = _images(placed, outline, piece)
         hinges = prepared.hinges[k - 1]
-        turn, misfit = _best_turn(images, prepared.ends[k].uv, prepared.inner[k], hinges, config.assembly)
+        first = before[k] if before else None
+        turn, misfit = _best_turn(
+            images, prepared.ends[k].uv, prepared.inner[k], hinges, first, config.assembly
+        )
         turns.append(turn)
         placed.append(_moved(piece, turn, config.assembly))
         cost += misfit
@@ -243,10 +260,75 @@ def _alternate(prepared: _Prepared, trial: _Trial, config: Config, times: int) -
     for _ in range(times):
         evidence = _ends_evidence(prepared, prepared.main, trial.turns, config)
         template = trial.template
-        poses, states, energy = refine(template, evidence, trial.pose[None], trial.state[None], CUTS)
-        trial = _trial(prepared, template, poses[0], states[0], config)
+        poses, states, energy = refine(
+            template, evidence, trial.pose[None], trial.state[None], CUTS
+        )
+        trial = _trial(prepared, template, poses[0], states[0], config, trial.turns)
         trial = replace(trial, energy=float(energy[0]))
     return trial
+
+
+def _polished(prepared: _Prepared, trial: _Trial, config: Config) -> _Trial:
+    """Places and outline together: every place is judged with the outline that fits it best."""
+    template, (main, *loose) = trial.template, prepared.flattened.pieces
+    ways = np.vstack([np.eye(3), -np.eye(3)])
+    for k, piece in enumerate(loose, start=1):
+        images = _images(
+            [p for n, p in enumerate(trial.placed) if n != k], main.surface.uv[:3], piece
+        )
+        step = np.array([0.04, 0.006, 0.006])
+        best = _joint_energy(prepared, trial, k, trial.turns[k], images, config)
+        while step[1] > 0.0004:
+            turns = [trial.turns[k].by(move) for move in ways * step]
+            tried = [_joint_energy(prepared, trial, k, turn, images, config) for turn in turns]
+            least = min(range(len(tried)), key=lambda n: tried[n].energy + tried[n].cost)
+            if tried[least].energy + tried[least].cost < best.energy + best.cost - 1e-6:
+                trial = best = tried[least]
+            else:
+                step = step / 2
+        trial = best
+        placed = [
+            *trial.placed[:k],
+            _moved(piece, trial.turns[k], config.assembly),
+            *trial.placed[k + 1 :],
+        ]
+        trial = replace(trial, placed=tuple(placed))
+    return trial
+
+
+def _joint_energy(
+    prepared: _Prepared,
+    trial: _Trial,
+    k: int,
+    turn: _Turn,
+    images: _Images,
+    config: Config,
+) -> _Trial:
+    """The trial with piece k elsewhere, and the outline fitted to that."""
+    turns = (*trial.turns[:k], turn, *trial.turns[k + 1 :])
+    evidence = _ends_evidence(prepared, prepared.main, turns, config)
+    pose, state, energy = refine(
+        trial.template, evidence, trial.pose[None], trial.state[None], CUTS[-3:]
+    )
+    hinges = prepared.hinges[k - 1]
+    off = np.linalg.norm(turn(hinges.here) - hinges.there, axis=1).min() / hinges.sigma_m
+    place_ = np.r_[turn.angle, turn.fixed, turn.moving][None]
+    beside = _costs(
+        images,
+        prepared.ends[k].uv,
+        prepared.inner[k],
+        place_,
+        np.array([[off, 0.0]]),
+        config.assembly,
+    )
+    return replace(
+        trial,
+        pose=pose[0],
+        state=state[0],
+        turns=turns,
+        energy=float(energy[0]),
+        cost=float(beside[1, 0]),
+    )
 
 
 def _finished(prepared: _Prepared, trial: _Trial, config: Config) -> Assembly:
@@ -255,7 +337,11 @@ def _finished(prepared: _Prepared, trial: _Trial, config: Config) -> Assembly:
     union = united(trial.placed)
     outline = trace_outline(union.surface, config.assembly.sigma_m, HALF_PIXEL_M, config.contour)
     whole = replace(
-        prepared.flattened, points=union.points, start_uv=union.start_uv, pieces=(union,), outline=outline
+        prepared.flattened,
+        points=union.points,
+        start_uv=union.start_uv,
+        pieces=(union,),
+        outline=outline,
     )
     evidence = evidence_from(outline, union.points, config.recognition)
     evidence = _ends_evidence(prepared, evidence, trial.turns, config)
@@ -263,8 +349,26 @@ def _finished(prepared: _Prepared, trial: _Trial, config: Config) -> Assembly:
     hessian = linearise(template, evidence, pose, state, CUTS[-1]).hessian[0]
     prior = np.diag(np.r_[1e-6, 1e-6, 1e-6, np.ones(template.dimensions)])
     occam = 0.5 * float(np.linalg.slogdet(hessian + prior)[1])
-    chance = -float(energy[0]) - occam - trial.cost
+    hidden = _hidden_share(
+        place(template, pose[0], state[0])[0][: template.vertices], union.surface
+    )
+    cost = trial.cost + 0.5 * (max(hidden - USUALLY_HIDDEN, 0.0) / HIDDEN_SPREAD) ** 2
+    chance = -float(energy[0]) - occam - cost
     return Assembly(template, pose[0], state[0], evidence, whole, chance)
+
+
+def _hidden_share(outline: Float, surface: FlatSurface) -> float:
+    """Share of a category's outline that no view shows: the views are chosen to show the item."""
+    low = outline.min(axis=0)
+    cols, rows = np.ceil((outline.max(axis=0) - low) / CELL_M).astype(int) + 2
+    body = np.zeros((rows, cols), np.uint8)
+    cv2.fillPoly(body, [np.rint((outline - low) / CELL_M).astype(np.int32)], (1,))
+    at = np.rint((surface.uv - low) / CELL_M).astype(int)
+    col, row = at[((at >= 0) & (at < [cols, rows])).all(axis=1)].T
+    seen = np.zeros((rows, cols), np.uint8)
+    seen[row, col] = 1
+    seen = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)).astype(np.uint8)
+    return 1.0 - float((seen & body).sum()) / max(float(body.sum()), 1.0)
 
 
 def _ends_evidence(
@@ -274,7 +378,9 @@ def _ends_evidence(
     ends, recognition = prepared.ends[: len(turns)], config.recognition
     uv = np.vstack([turn(e.uv) for turn, e in zip(turns, ends, strict=True)])
     normal = np.vstack([turn.direction(e.normal) for turn, e in zip(turns, ends, strict=True)])
-    sigma = [np.full(len(e.uv), 0.002 if k == 0 else config.assembly.sigma_m) for k, e in enumerate(ends)]
+    sigma = [
+        np.full(len(e.uv), 0.002 if k == 0 else config.assembly.sigma_m) for k, e in enumerate(ends)
+    ]
     inner = np.vstack([turn(points) for turn, points in zip(turns, prepared.inner, strict=False)])
     return replace(
         union,
@@ -302,20 +408,33 @@ def _seen(union: Evidence, ends: Float) -> Float:
 
 
 def _best_turn(
-    images: _Images, ends: Float, inner: Float, hinges: _Hinges, config: AssemblyConfig
+    images: _Images,
+    ends: Float,
+    inner: Float,
+    hinges: _Hinges,
+    first: _Turn | None,
+    config: AssemblyConfig,
 ) -> tuple[_Turn, float]:
-    """Best of all hinges and rotations, refined; and its cost beyond the ends' misfit."""
-    angle = np.arange(config.rotations) * (2 * np.pi / config.rotations)
-    trials = np.array([(a, *p, *q) for p, q in zip(hinges.there, hinges.here, strict=True) for a in angle])
+    """Best of all hinges and rotations, or of those near the first, and its cost beside the ends'."""
+    spread = np.pi / config.rotations
+    if first is None:
+        angle = np.arange(config.rotations) * 2.0 * spread
+        pairs = zip(hinges.there, hinges.here, strict=True)
+        trials = np.array([(a, *p, *q) for p, q in pairs for a in angle])
+    else:
+        trials = np.array(
+            [(first.angle, *p, *q) for p, q in zip(hinges.there, hinges.here, strict=True)]
+        )
     costs = _costs(images, ends, inner, trials, np.zeros((len(trials), 2)), config).sum(axis=0)
     best = int(costs.argmin())
     cost, turn, shift = costs[best], trials[best], np.zeros(2)
-    step = np.array([np.pi / config.rotations, 0.02, 0.02])
+    step = np.array([spread, 0.02, 0.02])
     ways = np.vstack([np.eye(3), -np.eye(3)])
-    while step[1] > 0.0005:
+    while step[1] > 0.001:
         moves = ways * step
         trials = np.column_stack([turn[:3] + moves, np.tile(turn[3:], (6, 1))])
-        costs = _costs(images, ends, inner, trials, (shift + moves[:, 1:]) / hinges.sigma_m, config).sum(axis=0)
+        off = (shift + moves[:, 1:]) / hinges.sigma_m
+        costs = _costs(images, ends, inner, trials, off, config).sum(axis=0)
         best = int(costs.argmin())
         if costs[best] < cost - 1e-9:
             cost, turn, shift = costs[best], trials[best], shift + moves[best, 1:]
@@ -377,7 +496,9 @@ def _images(placed: Sequence[FlatPiece], outline: Float, piece: FlatPiece) -> _I
     free = cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)).astype(np.uint8)
 
     def depth(image: Float) -> Float:
-        return cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_5).astype(np.float64) * CELL_M
+        return (
+            cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_5).astype(np.float64) * CELL_M
+        )
 
     return _Images(low, depth(1 - body) - depth(body), depth(1 - free))
 
@@ -399,7 +520,9 @@ def _hinges(main: FlatSurface, piece: FlatSurface, config: AssemblyConfig) -> _H
     rise = height - height.mean()
     top, highest = int(height.argmax()), float(piece.xyz_hanger[:, 2].max())
     turn, shift = _rigid(p, q)
-    along = rise @ (p - p.mean(axis=0)) / max(float(rise @ rise), 1e-12)  # change of place with height
+    along = (
+        rise @ (p - p.mean(axis=0)) / max(float(rise @ rise), 1e-12)
+    )  # change of place with height
     if np.ptp(height) < 2 * config.touch_m or len(touching) < 10:
         along = np.zeros(2)
     up = np.linspace(0.0, highest + config.touch_m - height[top], config.hinges)
@@ -444,7 +567,9 @@ def _moved(piece: FlatPiece, turn: _Turn, config: AssemblyConfig) -> FlatPiece:
         uv=turn(piece.points.uv),
         sigma_m=np.hypot(piece.points.sigma_m, config.sigma_m),
     )
-    return FlatPiece(points, turn(piece.start_uv), replace(piece.surface, uv=turn(piece.surface.uv)))
+    return FlatPiece(
+        points, turn(piece.start_uv), replace(piece.surface, uv=turn(piece.surface.uv))
+    )
 
 
 def united(pieces: Sequence[FlatPiece]) -> FlatPiece:

@@ -47,8 +47,10 @@ def _check(section: str, item: dataclasses.Field[Any], kind: Any, value: Any) ->
     if kind in (int, bool, str) and type(value) is not kind:
         raise InvalidConfig(f"{name}: expected {kind.__name__}, got {value!r}")
     low, high = item.metadata.get("low"), item.metadata.get("high")
-    if low is not None and not value >= low or high is not None and not value <= high:
-        raise InvalidConfig(f"{name}: expected {low} to {high}, got {value}; {item.metadata['doc']}")
+    if (low is not None and not value >= low) or (high is not None and not value <= high):
+        raise InvalidConfig(
+            f"{name}: expected {low} to {high}, got {value}; {item.metadata['doc']}"
+        )
     choices = item.metadata.get("choices", ())
     if choices and value not in choices:
         raise InvalidConfig(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
@@ -195,7 +197,10 @@ class PatchConfig(Checked):
     """Parts of a view that no crease and no depth jump cuts apart."""
 
     step_m: float = option(
-        0.003, "Smallest step between neighbouring pixels that parts two layers, m.", low=1e-4, high=0.1
+        0.003,
+        "Smallest step between neighbouring pixels that parts two layers, m.",
+        low=1e-4,
+        high=0.1,
     )
     step_sigmas: float = option(
         4.0, "The same in standard deviations of the steps that noise makes.", low=1.0, high=20.0
@@ -204,13 +209,22 @@ class PatchConfig(Checked):
         0.008, "The same where too few pixels are around for the slopes, m.", low=1e-4, high=0.1
     )
     jump_m: float = option(
-        0.03, "Change of depth to the next pixel that is a step on any slope, m.", low=0.001, high=1.0
+        0.03,
+        "Change of depth to the next pixel that is a step on any slope, m.",
+        low=0.001,
+        high=1.0,
     )
     margin_px: int = option(
-        2, "Patches do not join through what is this near to a line of steps, pixels.", low=0, high=20
+        2,
+        "Patches do not join through what is this near to a line of steps, pixels.",
+        low=0,
+        high=20,
     )
     gap_px: int = option(
-        5, "Where other cloth follows within this, a patch's end need not be the item's, pixels.", low=1, high=50
+        5,
+        "Where other cloth follows within this, a patch's end need not be the item's, pixels.",
+        low=1,
+        high=50,
     )
     min_points: int = option(40, "Patches of fewer pixels are left out.", low=3, high=100000)
 
@@ -226,7 +240,10 @@ class GeodesicConfig(Checked):
     )
     nodes: int = option(50, "Nodes M of a line.", low=3, high=500)
     height_window_m: float = option(
-        0.05, "Pairs of boundary points nearer in height than this get a line, m.", low=0.0, high=2.0
+        0.05,
+        "Pairs of boundary points nearer in height than this get a line, m.",
+        low=0.0,
+        high=2.0,
     )
 
 
@@ -274,11 +291,15 @@ class FlatteningConfig(Checked):
     )
     spring_steps: int = option(20000, "Most steps of the springs.", low=1, high=1000000)
     rounds: int = option(8, "Most reweightings of the majorisation.", low=1, high=1000)
-    inner_steps: int = option(10, "Steps of the majorisation with the same weights.", low=1, high=1000)
+    inner_steps: int = option(
+        10, "Steps of the majorisation with the same weights.", low=1, high=1000
+    )
     robust_sigmas: float = option(
         4.0, "Distances off by more standard deviations lose their say.", low=0.5, high=100.0
     )
-    tolerance_m: float = option(2e-6, "The search ends when points move less, m.", low=1e-9, high=0.01)
+    tolerance_m: float = option(
+        2e-6, "The search ends when points move less, m.", low=1e-9, high=0.01
+    )
 
 
 @dataclass(frozen=True)
@@ -286,19 +307,25 @@ class AssemblyConfig(Checked):
     """Placing pieces that hidden folds part from the rest, by the category's outline."""
 
     rotations: int = option(60, "Rotations tried.", low=4, high=3600)
-    hinges: int = option(5, "Places tried for the tip of a fold between two pieces.", low=1, high=100)
+    hinges: int = option(
+        5, "Places tried for the tip of a fold between two pieces.", low=1, high=100
+    )
     categories: int = option(
         3, "Likeliest categories for which pieces are placed with care.", low=1, high=100
     )
     hopeless: float = option(
-        15.0, "Outlines that fit the main piece worse than the best by this, in sigma squared halves, are dropped.", low=0.0, high=1000.0
+        15.0,
+        "Outlines that fit the main piece worse than the best by this, in sigma squared halves, are dropped.",
+        low=0.0,
+        high=1000.0,
     )
     alternations: int = option(
-        4, "Times that pieces are placed and the outline is fitted, in turns; 0: not.", low=0, high=100
+        6,
+        "Times that pieces are placed and the outline is fitted, in turns; 0: not.",
+        low=0,
+        high=100,
     )
-    touch_m: float = option(
-        0.012, "Cloth this near as it hangs may touch, m.", low=0.001, high=0.1
-    )
+    touch_m: float = option(0.012, "Cloth this near as it hangs may touch, m.", low=0.001, high=0.1)
     joined_m: float = option(
         0.006, "Cloth this near as it hangs is joined there, m.", low=0.0005, high=0.1
     )
@@ -306,7 +333,10 @@ class AssemblyConfig(Checked):
         0.004, "Pieces may overlap by so much in the plane, m.", low=0.0, high=0.1
     )
     hinge_m: float = option(
-        0.012, "How far from there the pieces may meet in the plane, one sigma, m.", low=0.001, high=0.5
+        0.012,
+        "How far from there the pieces may meet in the plane, one sigma, m.",
+        low=0.001,
+        high=0.5,
     )
     misfit_m: float = option(
         0.01, "How far ends may be from the category's outline, one sigma, m.", low=0.001, high=0.1
@@ -329,12 +359,20 @@ class AssemblyConfig(Checked):
 class ContourConfig(Checked):
     """Flattened points to outline."""
 
-    cell_m: float = option(0.002, "Cell of the raster that unites the views, m.", low=5e-4, high=0.02)
+    cell_m: float = option(
+        0.002, "Cell of the raster that unites the views, m.", low=5e-4, high=0.02
+    )
     close_m: float = option(
-        0.003, "Gaps of the flattened surface narrower than twice this are closed, m.", low=0.0, high=0.1
+        0.003,
+        "Gaps of the flattened surface narrower than twice this are closed, m.",
+        low=0.0,
+        high=0.1,
     )
     bridge_m: float = option(
-        0.04, "The same for gaps between ends of what was seen, not of the item, m.", low=0.0, high=0.5
+        0.04,
+        "The same for gaps between ends of what was seen, not of the item, m.",
+        low=0.0,
+        high=0.5,
     )
     spacing_m: float = option(0.005, "Spacing of the outline's points, m.", low=0.001, high=0.1)
     smooth_m: float = option(0.003, "Smoothing along the outline, one sigma, m.", low=0.0, high=0.1)
@@ -351,9 +389,14 @@ class RecognitionConfig(Checked):
         0.05, "Decay of eq. 11's model images, in longest lengths.", low=0.005, high=0.5
     )
     model_rotations: int = option(180, "Rotations tried by eq. 11.", low=8, high=3600)
-    fit_rotations: int = option(24, "Rotations from which the outlines are fitted.", low=4, high=360)
+    fit_rotations: int = option(
+        24, "Rotations from which the outlines are fitted.", low=4, high=360
+    )
     misfit_m: float = option(
-        0.008, "How far cuts differ from the categories' outlines, one sigma, m.", low=0.001, high=0.1
+        0.008,
+        "How far cuts differ from the categories' outlines, one sigma, m.",
+        low=0.001,
+        high=0.1,
     )
     correlation_m: float = option(
         0.08, "Length of outline over which errors are alike, m.", low=0.005, high=1.0
@@ -368,10 +411,16 @@ class MeasurementConfig(Checked):
     """Category and outline to sizes and landmarks."""
 
     landmark_radius_m: float = option(
-        0.02, "Farthest seen point from a landmark whose place in 3-D it gives, m.", low=0.002, high=0.2
+        0.02,
+        "Farthest seen point from a landmark whose place in 3-D it gives, m.",
+        low=0.002,
+        high=0.2,
     )
     layer_gap_m: float = option(
-        0.02, "Points of one flat place farther apart in 3-D lie on two layers, m.", low=0.002, high=0.5
+        0.02,
+        "Points of one flat place farther apart in 3-D lie on two layers, m.",
+        low=0.002,
+        high=0.5,
     )
     low_coverage: float = option(
         0.75, "Share of the item seen below which the result says so.", low=0.0, high=1.0
@@ -398,9 +447,7 @@ class RotationConfig(Checked):
     overlap_deg: float = option(
         50.0, "Views nearer in angle are registered to one another, deg.", low=1.0, high=180.0
     )
-    register_points: int = option(
-        500, "Points of a view that are registered.", low=50, high=100000
-    )
+    register_points: int = option(500, "Points of a view that are registered.", low=50, high=100000)
     register_reach_m: float = option(
         0.008, "Points farther apart are not the same cloth, m.", low=0.001, high=0.1
     )
@@ -423,14 +470,15 @@ class RotationConfig(Checked):
     valley_m: float = option(
         0.001, "Deepest groove that a link round a rim may cross, m.", low=0.0, high=0.02
     )
-    landmarks: int = option(
-        300, "Samples whose mutual distances are unfolded.", low=50, high=5000
-    )
+    landmarks: int = option(300, "Samples whose mutual distances are unfolded.", low=50, high=5000)
     local_m: float = option(
         0.15, "Nearer pairs on one sheet keep their distance both ways, m.", low=0.01, high=2.0
     )
     close_m: float = option(
-        0.003, "Gaps between flattened samples narrower than twice this are closed, m.", low=0.002, high=0.1
+        0.003,
+        "Gaps between flattened samples narrower than twice this are closed, m.",
+        low=0.002,
+        high=0.1,
     )
     edge_blur_m: float = option(
         0.004, "Blur of the flattened samples' density, m.", low=0.001, high=0.05
@@ -451,20 +499,27 @@ class RotationConfig(Checked):
         0.9, "Certainty of the category below which another hypothesis is tried.", low=0.0, high=1.0
     )
     overlaid: float = option(
-        0.07, "Share of the surface lying on more of its side that asks for another hypothesis.", low=0.0, high=1.0
+        0.07,
+        "Share of the surface lying on more of its side that asks for another hypothesis.",
+        low=0.0,
+        high=1.0,
     )
     untrusted_overlap: float = option(
-        0.1, "Share of the surface lying on more of its side above which the result says so.", low=0.0, high=1.0
+        0.1,
+        "Share of the surface lying on more of its side above which the result says so.",
+        low=0.0,
+        high=1.0,
     )
     neck_m: float = option(
-        0.03, "Radius of a disc without which the surface round a false neck falls in two, m.", low=0.005, high=0.2
+        0.03,
+        "Radius of a disc without which the surface round a false neck falls in two, m.",
+        low=0.005,
+        high=0.2,
     )
     detour_m: float = option(
         0.12, "Shortest way round a neck that may be false, m.", low=0.01, high=5.0
     )
-    unfold_rounds: int = option(
-        10, "Reweightings at each strength of spreading.", low=1, high=1000
-    )
+    unfold_rounds: int = option(10, "Reweightings at each strength of spreading.", low=1, high=1000)
 
 
 @dataclass(frozen=True)
@@ -489,7 +544,9 @@ class Config:
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
-            raise InvalidConfig(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+            raise InvalidConfig(
+                f"method: expected one of {', '.join(METHODS)}, got {self.method!r}"
+            )
 
 
 def sections() -> Iterator[tuple[str, type[Checked]]]:
@@ -528,7 +585,11 @@ def config_from(values: Mapping[str, Any], base: Config | None = None) -> Config
     if "method" in given:
         changed["method"] = given["method"]
     for name, kind in sections():
-        own = {f.name: given[f"{name}.{f.name}"] for f in dataclasses.fields(kind) if f"{name}.{f.name}" in given}
+        own = {
+            f.name: given[f"{name}.{f.name}"]
+            for f in dataclasses.fields(kind)
+            if f"{name}.{f.name}" in given
+        }
         if own:
             changed[name] = dataclasses.replace(getattr(base, name), **_as_floats(kind, own))
     return dataclasses.replace(base, **changed)

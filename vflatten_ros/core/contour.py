@@ -17,7 +17,9 @@ from vflatten_ros.core.values import Bool, FlatSurface, Float, Outline
 MOST_ENDS = 0.3  # of a gap's rim may be ends of the item, for the gap to be filled
 
 
-def trace_outline(surface: FlatSurface, sigma_m: float, margin_m: float, config: ContourConfig) -> Outline:
+def trace_outline(
+    surface: FlatSurface, sigma_m: float, margin_m: float, config: ContourConfig
+) -> Outline:
     """Outline of the union of flattened cells.
 
     Parameters
@@ -58,12 +60,16 @@ def trace_outline(surface: FlatSurface, sigma_m: float, margin_m: float, config:
     line = _grown(line, margin_m + 0.5 * config.cell_m)
     distance, nearest = cKDTree(uv).query(line, k=min(4, len(uv)))
     nearest = nearest.reshape(len(line), -1)
-    seen = (distance.reshape(len(line), -1)[:, 0] < config.seen_m + margin_m) & edge[nearest].any(axis=1)
+    seen = (distance.reshape(len(line), -1)[:, 0] < config.seen_m + margin_m) & edge[nearest].any(
+        axis=1
+    )
     sigma = np.full(len(line), np.hypot(sigma_m, 0.5 * config.cell_m))
     return Outline(line, np.where(seen, sigma, np.maximum(sigma, 0.03)), ~seen)
 
 
-def outline_of_polygons(polygons: Sequence[Float], sigma_m: float, config: ContourConfig) -> Outline:
+def outline_of_polygons(
+    polygons: Sequence[Float], sigma_m: float, config: ContourConfig
+) -> Outline:
     """Outline of the union of polygons, (k, 2) metres each; of the largest part if there are several."""
     low = np.vstack(polygons).min(axis=0) - config.close_m - 4 * config.cell_m
     high = np.vstack(polygons).max(axis=0) + config.close_m + 4 * config.cell_m
@@ -117,7 +123,9 @@ def _bridged(image: Bool, uv: Float, edge: Bool, low: Float, config: ContourConf
     k = min(8, len(uv))
     near = cKDTree(uv).query(at[:, ::-1] * config.cell_m + low, k=k)[1].reshape(len(at), k)
     ends = edge[near].mean(axis=1) > 0.5
-    beside = cv2.dilate(label.astype(np.float32), np.ones((3, 3), np.uint8))[tuple(at.T)].astype(int)
+    beside = cv2.dilate(label.astype(np.float32), np.ones((3, 3), np.uint8))[tuple(at.T)].astype(
+        int
+    )
     share = np.bincount(beside, ends, count) / np.maximum(np.bincount(beside, minlength=count), 1)
     fill = share < MOST_ENDS
     fill[0] = False

@@ -19,7 +19,8 @@ MARGIN_M = 0.15  # of the images round the outline
 SAMPLES = 128  # of the outline, and most flattened points that a fit uses
 RIM_M = 0.03  # flattened points nearer than this to the outline, or outside, bound the item
 MOST_INFERRED = 0.6  # if more than this is, the flags say too little to go by
-GAP_WEIGHT = 2.5  # of a gap between points that are seen on both sides of it
+GAP_M = 0.05  # widest gap between parts of an item, as between its legs
+GAP_WEIGHT = 4.0  # of an outline along such a gap: cloth that no view shows is not missing so
 MOST_LINKED = 6000  # flattened points that are linked to find gaps
 
 
@@ -87,11 +88,13 @@ def evidence_from(outline: Outline, points: FlatPoints, config: RecognitionConfi
     depth = sample(distance, (points.uv - origin) / CELL_M)
     rim = np.flatnonzero(~points.inferred & (depth > -RIM_M))
     rim = rim[np.linspace(0, len(rim) - 1, min(len(rim), SAMPLES)).astype(int)]
+    normal = _normals(uv)
+    gap = _across_gaps(uv, normal, origin, distance)
     return Evidence(
         outline=uv,
-        normal=_normals(uv),
+        normal=normal,
         sigma=np.hypot(sigma, config.misfit_m),
-        weight=np.where(inferred, 0.0, weight) * np.where(_opened(uv, outline), GAP_WEIGHT, 1.0),
+        weight=np.where(inferred, 0.0, weight) * np.where(gap, GAP_WEIGHT, 1.0),
         inner=points.uv[rim],
         inner_sigma=np.hypot(points.sigma_m[rim], config.misfit_m),
         inner_weight=np.full(len(rim), 0.5 * weight * SAMPLES / max(len(rim), 1)),
@@ -162,10 +165,12 @@ def _with_gaps(
     return Outline(uv, given.sigma_m[near], given.inferred[near] & (far < 0.02))
 
 
-def _opened(uv: Float, outline: Outline) -> Bool:
-    """Points that go along an opened gap rather than along the outline that was given."""
-    far: Bool = cKDTree(_evenly(outline, 8 * SAMPLES).uv).query(uv)[0] > 0.01
-    return far
+def _across_gaps(uv: Float, normal: Float, origin: Float, distance: Float) -> Bool:
+    """Points that face other cloth across a narrow gap."""
+    steps = np.arange(0.008, GAP_M, CELL_M)
+    ahead = uv[:, None] + steps[:, None] * normal[:, None]
+    faced: Bool = (sample(distance, (ahead - origin) / CELL_M) < -CELL_M).any(axis=1)
+    return faced
 
 
 def _evenly(outline: Outline, count: int) -> Outline:

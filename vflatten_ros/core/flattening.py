@@ -96,7 +96,8 @@ def _springs(
         pull = vector * (1.0 - _wanted(network, length) / length)[:, None]
         force = np.column_stack(
             [
-                np.bincount(network.i, pull[:, k], count) - np.bincount(network.j, pull[:, k], count)
+                np.bincount(network.i, pull[:, k], count)
+                - np.bincount(network.j, pull[:, k], count)
                 for k in (0, 1)
             ]
         )
@@ -171,5 +172,3 @@ def _stress(network: DistanceNetwork, uv: Float) -> Float:
     pairs = np.bincount(network.i, minlength=count) + np.bincount(network.j, minlength=count)
     stress: Float = np.sqrt(total / np.maximum(pairs, 1))
     return stress
-
-

@@ -64,14 +64,20 @@ def consistent_pairs(points_a: Float, points_b: Float, config: IntegrationConfig
     keep = np.ones(len(points_a), dtype=bool)
     while keep.sum() > 3:
         rows = np.flatnonzero(keep)
-        miss = np.array([_miss_without(points_a[rows], points_b[rows], q) for q in range(len(rows))])
-        left = np.array([_spread_without(points_a[rows], points_b[rows], q) for q in range(len(rows))])
+        miss = np.array(
+            [_miss_without(points_a[rows], points_b[rows], q) for q in range(len(rows))]
+        )
+        left = np.array(
+            [_spread_without(points_a[rows], points_b[rows], q) for q in range(len(rows))]
+        )
         worst = int(np.lexsort((-miss, left))[0])
         if miss[worst] <= config.reject_m:
             break
         keep[rows[worst]] = False
     if 2 <= keep.sum() <= 3:
-        distance = [np.linalg.norm(p[keep][:, None] - p[keep][None], axis=-1) for p in (points_a, points_b)]
+        distance = [
+            np.linalg.norm(p[keep][:, None] - p[keep][None], axis=-1) for p in (points_a, points_b)
+        ]
         agree = np.abs(distance[0] - distance[1]) <= 2.0 * config.reject_m
         if keep.sum() == 3 and agree.sum() == 5:  # one pair of points agrees, the third is wrong
             rows = np.flatnonzero(keep)
@@ -112,7 +118,9 @@ def align(
         normals = b.normals @ motion[:3, :3].T
         normal = np.diag(np.r_[np.full(3, 1.0 / config.sway_m**2), _lag_weight(config)])
         right = np.r_[-motion[:3, 3] / config.sway_m**2, -turned * _lag_weight(config)]
-        i, j = same_surface(a.points, a.normals, points, normals, 0.012, 0.01 if step < 2 else 0.005)
+        i, j = same_surface(
+            a.points, a.normals, points, normals, 0.012, 0.01 if step < 2 else 0.005
+        )
         for rows, off, sigma, cut in (
             _surface_rows(a.points[i], a.normals[i], points[j]),
             _pair_rows(pairs_a, pairs_b @ motion[:3, :3].T + motion[:3, 3], config),
@@ -189,7 +197,12 @@ def _overlap(
     A patch that touches another in a few samples only may be another layer that ends there.
     """
     i, j = same_surface(
-        points[:shift], normals[:shift], points[shift:], normals[shift:], 1.1 * config.spacing_m, config.same_m
+        points[:shift],
+        normals[:shift],
+        points[shift:],
+        normals[shift:],
+        1.1 * config.spacing_m,
+        config.same_m,
     )
     over = relate(points, normals, i, j + shift)
     keep = np.zeros(len(i), dtype=bool)
@@ -204,7 +217,9 @@ def _overlap(
 
 
 def _pieces(count: int, relations: Relations) -> Int:
-    graph = coo_matrix((np.ones(len(relations.i)), (relations.i, relations.j)), shape=(count, count))
+    graph = coo_matrix(
+        (np.ones(len(relations.i)), (relations.i, relations.j)), shape=(count, count)
+    )
     label = connected_components(graph, directed=False)[1]
     order = np.argsort(-np.bincount(label), kind="stable")
     rank = np.empty(len(order), dtype=np.int64)

@@ -89,7 +89,10 @@ def _seen(fit: Fit, name: str) -> bool:
 def _bounds_seen(fit: Fit, path: Float, enough: float = 0.25) -> bool:
     """A size is bounded, at either end, by an edge across its direction there."""
     points = fit.points()
-    ends = ((path[0], points[path[0]] - points[path[1]]), (path[-1], points[path[-1]] - points[path[-2]]))
+    ends = (
+        (path[0], points[path[0]] - points[path[1]]),
+        (path[-1], points[path[-1]] - points[path[-2]]),
+    )
     return all(_edge_seen(fit, points[i], way / np.linalg.norm(way), enough) for i, way in ends)
 
 
@@ -135,11 +138,17 @@ def landmarks(
     result = []
     for name, i in fit.template.landmarks.items():
         near = (
-            seen[np.sort(np.array(tree.query_ball_point(placed[i], config.landmark_radius_m), np.int64))]
+            seen[
+                np.sort(
+                    np.array(tree.query_ball_point(placed[i], config.landmark_radius_m), np.int64)
+                )
+            ]
             if tree is not None
             else seen
         )
-        result.append(_landmark(name, placed[i], float(sigma[i]), points, near, probability, config))
+        result.append(
+            _landmark(name, placed[i], float(sigma[i]), points, near, probability, config)
+        )
     return tuple(result)
 
 
@@ -202,7 +211,9 @@ def _notices(
     notices = []
     for size in measurements[:2]:
         if size.inferred:
-            text = f"{size.name} {size.value_m:.3f} m rests on a part of the item that no view shows"
+            text = (
+                f"{size.name} {size.value_m:.3f} m rests on a part of the item that no view shows"
+            )
             notices.append(Notice(f"{size.name}_unseen", text))
     if coverage < config.low_coverage:
         text = f"{100 * coverage:.0f} % of the item was seen"

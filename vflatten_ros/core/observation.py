@@ -74,7 +74,9 @@ def edges(observation: Observation, uv: Float, step_m: float) -> Bool:
     hole = (j >= 0) & (flat < 1.5 * space + 0.004)  # False where either is nan
     before = (j >= 0) & ~hole & (depth[j] < depth[i] + step_m)
     balance = np.zeros(observation.place.max(axis=0) + 1)
-    np.add.at(balance, tuple(observation.place[i].T), np.where(hole, 0.0, np.where(before, 1.0, -1.0)))
+    np.add.at(
+        balance, tuple(observation.place[i].T), np.where(hole, 0.0, np.where(before, 1.0, -1.0))
+    )
     # the outline is ragged: single pixels face their neighbours along it
     around = cv2.boxFilter(balance, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
     hidden = around[tuple(observation.place.T)] > 0.5

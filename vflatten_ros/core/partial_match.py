@@ -20,9 +20,7 @@ SIZES = (0.9, 1.1, 1.4)  # of the whole item's longest extent over the piece's
 ROTATIONS = 24
 
 
-def matches(
-    template: Template, ends: Float, inner: Float, count: int
-) -> tuple[Float, Float]:
+def matches(template: Template, ends: Float, inner: Float, count: int) -> tuple[Float, Float]:
     """Best poses of typical cuts of a category for a piece of an item.
 
     Parameters
@@ -89,7 +87,7 @@ def _capped(distance: Float) -> Float:
 
 
 def _spectrum(image: Float) -> Float:
-    out: Float = fft.rfft2(image)
+    out: Float = fft.rfft2(image.astype(np.float32))
     return out
 
 

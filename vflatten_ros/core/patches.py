@@ -39,7 +39,9 @@ class Patches:
     """Smooth patches of one view; n points."""
 
     patch: Int  # (n,) number of the point's patch, largest first; -1: beside a step, or patch too small
-    fringe: Int  # (n,) the same with the points between patches, which may be of the one or the other
+    fringe: (
+        Int  # (n,) the same with the points between patches, which may be of the one or the other
+    )
     ends: Int  # (e, 2) points at an end of what is seen; the next point beyond, -1: none near
 
 

@@ -11,10 +11,9 @@ from vflatten_ros.core.assembly import assemble
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface, NotEnoughViews
 from vflatten_ros.core.measurement import measure
-from vflatten_ros.core.one_view import flatten_one_view
 from vflatten_ros.core.model_images import model_image_scores
-from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, recognise
-from vflatten_ros.core.recognition import _finish as finish
+from vflatten_ros.core.one_view import flatten_one_view
+from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, finish, recognise
 from vflatten_ros.core.rotation import Unfolded, turn_parts, unfold_views, unfold_without_necks
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template

@@ -26,7 +26,9 @@ from vflatten_ros.core.values import Bool, FlatPoints, Outline
 UNKNOWN = "unknown"
 BEST = 5  # hypotheses of a category that are refined to the end
 FREEDOM = 25.0  # of an ordinary category: what its pose and sizes cost in evidence
-COARSE = (12.0, 9.0, 6.0, 6.0)  # where residuals level off, in sigmas, for every step
+AS_CUT = 0.2  # of the swing of parts, where nothing turned them
+HOPELESS = 40.0  # a category with this much more energy than the best is not refined with care
+COARSE = (((12.0, 9.0), 16), ((6.0, 6.0), BEST))  # cuts of the steps, in sigmas; hypotheses kept
 FINE = (5.0, 4.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0)
 LAST = (3.0, 3.0, 3.0, 3.0, 3.0)
 
@@ -75,7 +77,7 @@ def recognise(
         raise InvalidInput("recognise: no categories to choose from; see config/categories")
     evidence = evidence_from(outline, points, config)
     scores = model_image_scores(evidence.outline, templates, config.decay, config.model_rotations)
-    fits = {t.category: fit_template(t, evidence, config) for t in templates}
+    fits = fit_templates(templates, evidence, config)
     probabilities = _probabilities(fits, evidence, config)
     category = max(probabilities, key=lambda name: probabilities[name])
     known = {name: p for name, p in probabilities.items() if name != UNKNOWN}
@@ -95,15 +97,38 @@ def recognise(
 
 def fit_template(template: Template, evidence: Evidence, config: RecognitionConfig) -> Fit:
     """The best pose and cut of one category."""
+    return fit_templates((template,), evidence, config)[template.category]
+
+
+def fit_templates(
+    templates: tuple[Template, ...], evidence: Evidence, config: RecognitionConfig
+) -> dict[str, Fit]:
+    """The best pose and cut of every category; those that turn out hopeless with less effort."""
+    coarse = {t.category: _coarse(t, evidence.thinned(), config) for t in templates}
+    least = min(float(energy[0]) for _, _, energy in coarse.values())
+    fits = {}
+    for template in templates:
+        pose, state, energy = coarse[template.category]
+        few = 1 if energy[0] > least + HOPELESS else BEST
+        pose, state, energy = refine(template, evidence, pose[:few], state[:few], FINE)
+        best = [int(energy.argmin())]
+        fits[template.category] = finish(template, evidence, pose[best], state[best])
+    return fits
+
+
+def _coarse(
+    template: Template, evidence: Evidence, config: RecognitionConfig
+) -> tuple[Float, Float, Float]:
+    """Poses and cuts from all rotations, best first; the worse half is dropped on the way."""
     pose, state = starts(template, evidence, config.fit_rotations)
-    pose, state, energy = refine(template, evidence.thinned(), pose, state, COARSE)
-    first = np.argsort(energy, kind="stable")[:BEST]
-    pose, state, energy = refine(template, evidence, pose[first], state[first], FINE)
-    best = energy.argmin()
-    return _finish(template, evidence, pose[best : best + 1], state[best : best + 1])
+    for cuts, keep in COARSE:
+        pose, state, energy = refine(template, evidence, pose, state, cuts)
+        first = np.argsort(energy, kind="stable")[:keep]
+        pose, state, energy = pose[first], state[first], energy[first]
+    return pose, state, energy
 
 
-def _finish(template: Template, evidence: Evidence, pose: Float, state: Float) -> Fit:
+def finish(template: Template, evidence: Evidence, pose: Float, state: Float) -> Fit:
     """The fit under the errors that were found, and how well it explains what was seen."""
     prior = np.diag(np.r_[1e-6, 1e-6, 1e-6, np.ones(template.dimensions)])
     scale = _spread(evidence, template, pose[0], state[0])
@@ -111,7 +136,7 @@ def _finish(template: Template, evidence: Evidence, pose: Float, state: Float) -
     system = linearise(template, evidence, pose, state, scale * LAST[-1])
     hessian = system.hessian[0] / scale**2 + prior
     energy = float(system.energy[0]) / scale**2 + 2.0 * evidence.total * np.log(scale)
-    freedom = 0.5 * float((state**2).sum()) + 0.5 * float(np.linalg.slogdet(hessian)[1])
+    freedom = _freedom(template, state[0], system.hessian[0] / scale**2)
     outline = place(template, pose[0], state[0])[0][: template.vertices]
     distance, seen = _edge_distances(evidence, outline)
     on = np.abs(distance) < 3.0 * float(np.median(evidence.sigma))
@@ -128,6 +153,24 @@ def _finish(template: Template, evidence: Evidence, pose: Float, state: Float) -
         explained=float((residual < 3.0).mean()) if trusted.any() else 0.0,
         edge_seen=(on & (seen > 0)).astype(float),
     )
+
+
+def _freedom(template: Template, state: Float, hessian: Float) -> float:
+    """What the pose and cut cost in evidence (Laplace's approximation).
+
+    Parts lie mostly as they were cut, and sometimes anyhow: half of the prior is narrow.
+    """
+    swings = np.zeros(template.dimensions, dtype=bool)
+    swings[len(template.sizes) + len(template.parts) :] = True
+    logs = []
+    for narrow in (1.0, AS_CUT) if swings.any() else (1.0,):
+        unit = np.where(swings, narrow, 1.0)
+        of_pose = np.r_[1.0, 1.0, 1.0, unit]
+        prior = np.diag(np.r_[1e-6, 1e-6, 1e-6, np.ones(template.dimensions)])
+        narrowed = hessian * of_pose * of_pose[:, None] + prior
+        volume = 0.5 * float(np.linalg.slogdet(narrowed)[1])
+        logs.append(-0.5 * float(((state / unit) ** 2).sum()) - volume)
+    return -float(np.logaddexp.reduce(logs)) + float(np.log(len(logs)))
 
 
 def _spread(evidence: Evidence, template: Template, pose: Float, state: Float) -> float:

@@ -69,7 +69,12 @@ def neighbours(points: Float, normals: Float, group: Int, reach_m: float) -> tup
 
 
 def same_surface(
-    points_a: Float, normals_a: Float, points_b: Float, normals_b: Float, reach_m: float, step_m: float
+    points_a: Float,
+    normals_a: Float,
+    points_b: Float,
+    normals_b: Float,
+    reach_m: float,
+    step_m: float,
 ) -> tuple[Int, Int]:
     """Pairs of samples of two views that show the same cloth: near, alike in direction, no step.
 

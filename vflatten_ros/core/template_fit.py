@@ -156,7 +156,9 @@ def _nearest_edge(
     distance = np.hypot(beyond, across)
     side = np.where(across < 0.0, -1.0, 1.0)
     share = np.maximum(distance, 1e-9)
-    direction = outward[batch, edge] * np.where(distance > 1e-9, np.abs(across) / share, 1.0)[..., None]
+    direction = (
+        outward[batch, edge] * np.where(distance > 1e-9, np.abs(across) / share, 1.0)[..., None]
+    )
     direction += forward[batch, edge] * (side * beyond / share)[..., None]
     return edge, along / length[batch, edge], side * distance, direction
 
@@ -259,9 +261,9 @@ def refine(
         if cut == cuts[-1]:
             better = energy < best
             best_x, best = np.where(better[:, None], x, best_x), np.where(better, energy, best)
-        step = np.linalg.solve(
-            system.hessian + damping, -(system.gradient + prior * x)[..., None]
-        )[..., 0]
+        step = np.linalg.solve(system.hessian + damping, -(system.gradient + prior * x)[..., None])[
+            ..., 0
+        ]
         over = np.abs(step / limit).max(axis=1, keepdims=True)
         x = x + step / np.maximum(over, 1.0)
     return best_x[:, :3], best_x[:, 3:], best

@@ -156,7 +156,9 @@ def _turn(angle: Float, bend: NDArray[np.bool_]) -> tuple[Float, Float]:
     cos_slope = np.where(bend, none, -np.sin(angle))
     sin_slope = np.where(bend, 0.5 * (1.0 + half**2), np.cos(angle))
     matrix = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
-    change = np.stack([np.stack([cos_slope, -sin_slope], -1), np.stack([sin_slope, cos_slope], -1)], -2)
+    change = np.stack(
+        [np.stack([cos_slope, -sin_slope], -1), np.stack([sin_slope, cos_slope], -1)], -2
+    )
     return matrix, change
 
 
@@ -214,7 +216,9 @@ class _Reader:
         self.sizes: list[str] = list(data["sizes"])
         self.parts: list[str] = list(data.get("parts") or {})
         self.names: list[str] = []
-        self.rows: list[tuple[Float, Float, int, bool, float]] = []  # fixed, turned, part, bend, side
+        self.rows: list[
+            tuple[Float, Float, int, bool, float]
+        ] = []  # fixed, turned, part, bend, side
 
     def template(self, name: str) -> Template:
         log_typical, log_spread = self.spreads()
@@ -267,7 +271,9 @@ class _Reader:
             typical[i], spread[i, i] = np.log(value), width
             if size.get("of") is not None:
                 if size["of"] not in self.sizes[:i]:
-                    raise InvalidConfig(f"sizes.{name}: {size['of']!r} is no size described above it")
+                    raise InvalidConfig(
+                        f"sizes.{name}: {size['of']!r} is no size described above it"
+                    )
                 base = self.sizes.index(size["of"])
                 typical[i] += typical[base]
                 spread[i] += spread[base]
@@ -276,7 +282,9 @@ class _Reader:
     def outline(self) -> None:
         half = list(self.data["half"])
         middle = [self.point(p) for p in half]
-        ends = [np.abs(row[0][0]).max() + np.abs(row[1][0]).max() for row in (middle[0], middle[-1])]
+        ends = [
+            np.abs(row[0][0]).max() + np.abs(row[1][0]).max() for row in (middle[0], middle[-1])
+        ]
         if max(ends) > 0.0:
             raise InvalidConfig("half must begin and end on the middle line, at u = 0")
         for point, row in zip(half, middle):
@@ -310,7 +318,12 @@ class _Reader:
         if point["part"] not in self.parts:
             raise InvalidConfig(f"no part {point['part']!r} among {self.parts}")
         pivot = self.data["parts"][point["part"]]["pivot"]
-        return np.array([self.sum(v) for v in pivot]), at, self.parts.index(point["part"]), bool(point.get("bend", False))
+        return (
+            np.array([self.sum(v) for v in pivot]),
+            at,
+            self.parts.index(point["part"]),
+            bool(point.get("bend", False)),
+        )
 
     def sum(self, value: Any) -> Float:
         """Coefficients of the sizes in '0.5 * waist - height' or 0."""
@@ -344,7 +357,9 @@ class _Reader:
     def step(self, point: Any) -> tuple[int, int]:
         if isinstance(point, str):
             if point not in self.names:
-                raise InvalidConfig(f"no point {point!r}; points are {', '.join(filter(None, self.names))}")
+                raise InvalidConfig(
+                    f"no point {point!r}; points are {', '.join(filter(None, self.names))}"
+                )
             return self.names.index(point), self.names.index(_mirror_name(point))
         row = self.point({"at": point})
         self.add("", row, 1.0)

@@ -45,7 +45,6 @@ from vflatten_ros.core.observation import Observation, edges, locate, observe, q
 from vflatten_ros.core.sampling import thinned
 from vflatten_ros.core.unrolling import Complex, Relations, carry, frames_of, unroll
 from vflatten_ros.core.values import (
-    Bool,
     Correspondence,
     DistanceNetwork,
     FlatPiece,
@@ -62,7 +61,7 @@ from vflatten_ros.core.values import (
     no_progress,
 )
 
-LINES_PER_POINT = 3  # geodesic lines that start at a boundary point
+LINES_PER_POINT = 1  # geodesic lines that start at a boundary point
 POINT_SIGMA_M = 0.002  # of a flattened point, whatever its stress
 MISFIT_M = 0.003  # of neighbours, beyond which they lose their say when unrolled
 SMALLEST = 0.05  # share of the main piece's samples that makes a piece worth placing
@@ -115,7 +114,8 @@ def _observe_pair(
 ) -> _Pair:
     first, second = _two_views(views, given)
     pixels = [
-        (c.pixel_a, c.pixel_b) if c.view_a == first.view_id else (c.pixel_b, c.pixel_a) for c in given
+        (c.pixel_a, c.pixel_b) if c.view_a == first.view_id else (c.pixel_b, c.pixel_a)
+        for c in given
     ]
     a = observe(first, config, lambda stage, share: progress(stage, 0.5 * share))
     b = observe(second, config, lambda stage, share: progress(stage, 0.5 + 0.5 * share))
@@ -176,9 +176,7 @@ class _Sampled:
 
 
 def _from_surfaces(pair: _Pair, config: Config, progress: Progress) -> Flattened:
-    a, b = (
-        _sample(o, at, config) for o, at in ((pair.a, pair.at_a), (pair.b, pair.at_b))
-    )
+    a, b = (_sample(o, at, config) for o, at in ((pair.a, pair.at_a), (pair.b, pair.at_b)))
     surface_a, surface_b = pair.a.surface, pair.b.surface
     motion = align(
         a.samples,
@@ -283,7 +281,10 @@ def _surface_lines(
 
 
 def _lines(pair: _Pair, found: Sequence[Geodesics]) -> GeodesicLines:
-    ids = [np.full(len(f.length_m), o.view.view_id) for f, o in zip(found, (pair.a, pair.b), strict=True)]
+    ids = [
+        np.full(len(f.length_m), o.view.view_id)
+        for f, o in zip(found, (pair.a, pair.b), strict=True)
+    ]
     return GeodesicLines(
         np.concatenate([f.nodes for f in found]),
         np.concatenate(ids),

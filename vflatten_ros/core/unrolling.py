@@ -148,7 +148,9 @@ def _carried(vector: Float, start: Float, end: Float) -> Float:
     return vector * cos + spin + axis * (_dot(axis, vector)[:, None] / np.maximum(1 + cos, 1e-9))
 
 
-def _laplacian(count: int, relations: Relations, weight: Float, turn: Complex | Float) -> csc_matrix:
+def _laplacian(
+    count: int, relations: Relations, weight: Float, turn: Complex | Float
+) -> csc_matrix:
     """Hermitian matrix of sum w |x_j - turn x_i|^2, slightly raised so that it can be inverted."""
     i, j = relations.i, relations.j
     values = np.concatenate([-weight * np.conj(turn), -weight * turn, weight, weight])
@@ -159,7 +161,9 @@ def _laplacian(count: int, relations: Relations, weight: Float, turn: Complex | 
 
 def _factored(matrix: csc_matrix) -> SuperLU:
     """Factors of a Hermitian matrix: an ordering for symmetric patterns keeps them sparse."""
-    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return splu(
+        matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
 
 
 def _angles(count: int, relations: Relations, weight: Float) -> Complex:
@@ -218,7 +222,13 @@ def frames_of(relations: Relations, uv: Float, frame: Complex, weight: Float) ->
 
 
 def carry(
-    points: Float, samples: Float, normals: Float, uv: Float, frame: Complex, near: Int, distance: Float
+    points: Float,
+    samples: Float,
+    normals: Float,
+    uv: Float,
+    frame: Complex,
+    near: Int,
+    distance: Float,
 ) -> Float:
     """Places in the plane of further points of the surface, from the samples around each.
 

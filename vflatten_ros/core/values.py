@@ -38,7 +38,9 @@ class Cloud:
 
     stamp_ns: int
     frame_id: str
-    xyz: NDArray[np.float32]  # (rows, cols, 3), rig frame, NaN where unmeasured; rows = 1: unorganised
+    xyz: NDArray[
+        np.float32
+    ]  # (rows, cols, 3), rig frame, NaN where unmeasured; rows = 1: unorganised
     rgb: Byte | None  # (rows, cols, 3), 0-255; None: the cloud has no colour
 
     @property
@@ -98,7 +100,9 @@ class View:
     @property
     def points_hanger(self) -> Float:
         """(n, 3) points in the item's own frame, by the wrist angle alone."""
-        return transform_points(inverse(self.calibration.T_rig_hanger(self.angle_rad)), self.points_rig)
+        return transform_points(
+            inverse(self.calibration.T_rig_hanger(self.angle_rad)), self.points_rig
+        )
 
     @property
     def points_view(self) -> Float:
@@ -197,7 +201,9 @@ class Flattened:
     outline: Outline
     correspondences: tuple[Correspondence, ...]  # that were used
     notices: tuple[Notice, ...]
-    pieces: tuple[FlatPiece, ...] = field(default=())  # the largest is the outline's; others are loose
+    pieces: tuple[FlatPiece, ...] = field(
+        default=()
+    )  # the largest is the outline's; others are loose
 
 
 @dataclass(frozen=True)
@@ -208,7 +214,9 @@ class Measurement:
     value_m: float
     sigma_m: float
     inferred: bool  # True: rests on parts that no view shows
-    ends_uv: tuple[tuple[float, float], tuple[float, float]] | None = None  # flat frame, for drawing
+    ends_uv: tuple[tuple[float, float], tuple[float, float]] | None = (
+        None  # flat frame, for drawing
+    )
 
 
 @dataclass(frozen=True)
@@ -253,7 +261,9 @@ class FlatGarment:
     view_ids: tuple[int, ...]
     stamp_ns: int  # newest view
     points: FlatPoints
-    start_uv: Float | None  # (n, 2) where the flattening started, rows as points; None: no single start
+    start_uv: (
+        Float | None
+    )  # (n, 2) where the flattening started, rows as points; None: no single start
     lines: GeodesicLines
     outline: Outline
     category: str  # best category or "unknown"

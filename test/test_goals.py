@@ -154,7 +154,7 @@ def test_a_task_goes_on_while_one_of_two_still_waits(office):
 
 def test_a_process_that_does_not_stop_is_ended_and_the_next_task_is_done(office):
     asker = office.ask(slow_work.STUBBORN)
-    office.until(lambda: asker.steps)
+    office.until(lambda: ("work", 0.0) in asker.steps)  # from now on it hears nothing
     began = time.monotonic()
     office.goals.withdraw(asker.listener)
     office.until(lambda: not office.goals.busy)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vflatten_ros.core import registration
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.geometry import inverse, rotation_about, transform_points
@@ -98,3 +99,13 @@ def test_one_view_and_an_empty_one_raise():
     none = View(0, 0, 0.0, np.zeros((0, 3)), np.zeros((0, 2), np.int32), None, (4, 4), CALIBRATION)
     with pytest.raises(NotEnoughViews, match="0 points"):
         view_surface(none, RotationConfig())
+
+
+def test_pairs_grow_with_the_views_not_with_their_square():
+    def pairs(count):
+        return registration._overlapping(np.linspace(0, 2 * np.pi, count, endpoint=False), 50.0)
+
+    assert len(pairs(12)) == 12 * 2  # 30 degrees apart: one on either side
+    assert len(pairs(100)) == 100 * 2 * registration.MOST_PARTNERS
+    first = {j for i, j in pairs(100) if i == 0}
+    assert {1, 99, 13, 87} <= first  # the nearest and, 47 degrees away, the farthest

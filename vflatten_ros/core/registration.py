@@ -22,6 +22,7 @@ from vflatten_ros.core.values import Int, View
 
 MIN_POINTS = 100  # a view with fewer item points shows nothing that could be placed
 PAIR_POINTS = 300.0  # noise is alike in neighbouring pixels: more pairs than this say no more
+MOST_PARTNERS = 4  # on either side of a view
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +121,22 @@ def register_views(surfaces: Sequence[ViewSurface], config: RotationConfig) -> l
 
 
 def _overlapping(angles: Sequence[float], reach_deg: float) -> list[tuple[int, int]]:
-    """Ordered pairs of views near enough in angle, round the full turn, to see the same cloth."""
-    turn = np.asarray(angles)[:, None] - np.asarray(angles)[None]
-    apart = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
-    near = (apart <= np.radians(reach_deg) + 1e-6) & ~np.eye(len(apart), dtype=bool)
-    return [(int(i), int(j)) for i, j in np.argwhere(near)]
+    """Ordered pairs of views near enough in angle, round the full turn, to see the same cloth.
+
+    A view has at most MOST_PARTNERS on either side, evenly chosen, the nearest and the farthest
+    among them: the cost grows with the views, not with their square.
+    """
+    turn = np.asarray(angles)[None] - np.asarray(angles)[:, None]
+    turn = (turn + np.pi) % (2 * np.pi) - np.pi
+    near = (np.abs(turn) <= np.radians(reach_deg) + 1e-6) & ~np.eye(len(turn), dtype=bool)
+    pairs = []
+    for i in range(len(turn)):
+        for side in (near[i] & (turn[i] < 0), near[i] & (turn[i] >= 0)):
+            there = np.flatnonzero(side)
+            there = there[np.argsort(np.abs(turn[i, there]), kind="stable")]
+            picked = np.linspace(0, len(there) - 1, min(len(there), MOST_PARTNERS)).astype(int)
+            pairs += [(i, int(j)) for j in np.sort(there[picked])]
+    return pairs
 
 
 def _thinned(surface: ViewSurface, count: int) -> Int:

@@ -1,8 +1,9 @@
 """Places loose pieces of a flattened item beside its main piece, as a category's outline has them.
 
-A hidden fold cuts the observed surface apart: how far the cloth turns in the fold is not seen. What is
-known of a loose piece: laid flat, the fold opens about its tip; the piece does not overlap the others;
-it lies inside the item's outline, with its own ends on that outline. The outline is the category's. It
+A hidden fold cuts the observed surface apart: how far the cloth turns in the fold is not seen. What
+is known of a loose piece: laid flat, the fold opens about its tip; the piece does not overlap the
+others; it lies inside the item's outline, with its own ends on that outline. The outline is the
+category's. It
 and the places of the pieces are found in turns, for the likeliest categories; the best explanation
 wins. Sizes that rest on a placed piece have its error.
 """
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import AssemblyConfig, Config, ContourConfig
@@ -146,7 +148,7 @@ def assemble(
     config: Config,
     progress: Progress = no_progress,
 ) -> list[Assembly]:
-    """Place the loose pieces as categories have them, and fit the categories to all pieces, in turns.
+    """Place the loose pieces as categories have them and fit these to all pieces, in turns.
 
     Parameters
     ----------
@@ -187,7 +189,7 @@ def assemble(
 
 
 def _stiff(template: Template) -> Template:
-    """Parts of a piece of observed cloth are not turned against one another: that would be stress."""
+    """Parts of one piece of cloth are not turned against one another: that would be stress."""
     return replace(template, swing=STIFF * template.swing)
 
 
@@ -226,7 +228,7 @@ def _prepare(flattened: Flattened, config: Config) -> _Prepared:
 
 
 def _near(main: Evidence) -> Evidence:
-    """Evidence of the main piece, which says nothing of what is farther off: other pieces come there."""
+    """Evidence of the main piece; it says nothing of what is farther off, where others come."""
     return replace(main, seen=np.where(main.distance < NEAR_M, main.seen, 0.0))
 
 
@@ -270,7 +272,7 @@ def _alternate(prepared: _Prepared, trial: _Trial, config: Config, times: int) -
 
 def _polished(prepared: _Prepared, trial: _Trial, config: Config) -> _Trial:
     """Places and outline together: every place is judged with the outline that fits it best."""
-    template, (main, *loose) = trial.template, prepared.flattened.pieces
+    main, *loose = prepared.flattened.pieces
     ways = np.vstack([np.eye(3), -np.eye(3)])
     for k, piece in enumerate(loose, start=1):
         images = _images(
@@ -374,7 +376,7 @@ def _hidden_share(outline: Float, surface: FlatSurface) -> float:
 def _ends_evidence(
     prepared: _Prepared, union: Evidence, turns: Sequence[_Turn], config: Config
 ) -> Evidence:
-    """What the fit of an outline rests on: the ends of every piece, also where they face another."""
+    """What the fit of an outline rests on: ends of every piece, even where they face another."""
     ends, recognition = prepared.ends[: len(turns)], config.recognition
     uv = np.vstack([turn(e.uv) for turn, e in zip(turns, ends, strict=True)])
     normal = np.vstack([turn.direction(e.normal) for turn, e in zip(turns, ends, strict=True)])
@@ -415,7 +417,7 @@ def _best_turn(
     first: _Turn | None,
     config: AssemblyConfig,
 ) -> tuple[_Turn, float]:
-    """Best of all hinges and rotations, or of those near the first, and its cost beside the ends'."""
+    """Best of all hinges and rotations, or of those near the first, and its cost but the ends'."""
     spread = np.pi / config.rotations
     if first is None:
         angle = np.arange(config.rotations) * 2.0 * spread
@@ -468,7 +470,8 @@ def _all_turned(trials: Float, uv: Float) -> Float:
     """(t, n, 2) places of (n, 2) points under (t, 5) trials."""
     angle, fixed, moving = trials[:, 0], trials[:, 1:3], trials[:, 3:]
     arm = (uv[None] - moving[:, None]) @ np.array([1.0, 1j]) * np.exp(1j * angle)[:, None]
-    return np.stack([arm.real, arm.imag], axis=-1) + fixed[:, None]
+    result: Float = np.stack([arm.real, arm.imag], axis=-1) + fixed[:, None]
+    return result
 
 
 def _soft(off: Float, cut: float) -> Float:
@@ -495,12 +498,14 @@ def _images(placed: Sequence[FlatPiece], outline: Float, piece: FlatPiece) -> _I
     free[row, col] = 0
     free = cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)).astype(np.uint8)
 
-    def depth(image: Float) -> Float:
-        return (
+    def depth(image: NDArray[np.uint8]) -> Float:
+        result: Float = (
             cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_5).astype(np.float64) * CELL_M
         )
+        return result
 
-    return _Images(low, depth(1 - body) - depth(body), depth(1 - free))
+    one = np.uint8(1)
+    return _Images(low, depth(one - body) - depth(body), depth(one - free))
 
 
 def _hinges(main: FlatSurface, piece: FlatSurface, config: AssemblyConfig) -> _Hinges:
@@ -558,7 +563,8 @@ def _ends(piece: FlatPiece, contour: ContourConfig) -> _Ends:
 
 
 def _thin(uv: Float) -> Float:
-    return uv[np.linspace(0, len(uv) - 1, min(len(uv), MOST)).astype(int)]
+    result: Float = uv[np.linspace(0, len(uv) - 1, min(len(uv), MOST)).astype(int)]
+    return result
 
 
 def _moved(piece: FlatPiece, turn: _Turn, config: AssemblyConfig) -> FlatPiece:

@@ -69,7 +69,7 @@ def _evenly(contour: Float, spacing: float) -> Float:
     """Points at about equal distances along a closed line of pixels."""
     closed = np.vstack([contour, contour[:1]])
     at = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))]
-    count = int(round(at[-1] / spacing))
+    count = round(float(at[-1]) / spacing)
     wanted = np.arange(count) * (at[-1] / max(count, 1))
     return np.column_stack([np.interp(wanted, at, column) for column in closed.T])
 

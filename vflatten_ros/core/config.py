@@ -253,12 +253,12 @@ class IntegrationConfig(Checked):
 
     evidence: str = option(
         "surface",
-        "'boundary': the paper's boundary points and lines alone; 'surface': samples of the whole surface.",
+        "'boundary': the paper's boundary points and lines; 'surface': samples of all cloth.",
         choices=("surface", "boundary"),
     )
     overlap: bool = option(
         True,
-        "With 'surface': join the views by all cloth that both show, not by the corresponding points alone.",
+        "With 'surface': join the views by all cloth that both show, not by given points alone.",
     )
     spacing_m: float = option(0.009, "Spacing of the surface samples, m.", low=0.002, high=0.1)
     pair_sigma_m: float = option(
@@ -315,7 +315,7 @@ class AssemblyConfig(Checked):
     )
     hopeless: float = option(
         15.0,
-        "Outlines that fit the main piece worse than the best by this, in sigma squared halves, are dropped.",
+        "Outlines that fit worse than the best by this, in halves of sigma squared, are dropped.",
         low=0.0,
         high=1000.0,
     )

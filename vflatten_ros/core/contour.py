@@ -70,7 +70,7 @@ def trace_outline(
 def outline_of_polygons(
     polygons: Sequence[Float], sigma_m: float, config: ContourConfig
 ) -> Outline:
-    """Outline of the union of polygons, (k, 2) metres each; of the largest part if there are several."""
+    """Outline of the union of polygons, (k, 2) metres each; of its largest part."""
     low = np.vstack(polygons).min(axis=0) - config.close_m - 4 * config.cell_m
     high = np.vstack(polygons).max(axis=0) + config.close_m + 4 * config.cell_m
     shape = tuple(np.ceil((high - low) / config.cell_m).astype(int)[::-1] + 1)
@@ -109,11 +109,12 @@ def _closed(image: Bool, radius: float) -> Bool:
     away = cv2.distanceTransform((~image).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     wide = (away <= radius).astype(np.uint8)
     inner = cv2.distanceTransform(np.pad(wide, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    return (inner > radius) | image
+    result: Bool = (inner > radius) | image
+    return result
 
 
 def _bridged(image: Bool, uv: Float, edge: Bool, low: Float, config: ContourConfig) -> Bool:
-    """Wider gaps filled if nearly all around them was unseen: a fold's gap goes, a leg's gap stays."""
+    """Wider gaps filled if nearly all around was unseen: a fold's gap goes, a leg's gap stays."""
     gap = _closed(image, config.bridge_m / config.cell_m) & ~image
     count, label = cv2.connectedComponents(gap.astype(np.uint8), connectivity=4)
     rim = image & (cv2.dilate(gap.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
@@ -129,7 +130,8 @@ def _bridged(image: Bool, uv: Float, edge: Bool, low: Float, config: ContourConf
     share = np.bincount(beside, ends, count) / np.maximum(np.bincount(beside, minlength=count), 1)
     fill = share < MOST_ENDS
     fill[0] = False
-    return image | fill[label]
+    result: Bool = image | fill[label]
+    return result
 
 
 def _largest(image: Bool) -> Float:
@@ -146,7 +148,7 @@ def _largest(image: Bool) -> Float:
 def _evenly(line: Float, spacing: float) -> Float:
     closed = np.vstack([line, line[:1]])
     at = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))]
-    count = max(8, int(round(at[-1] / spacing)))
+    count = max(8, round(float(at[-1]) / spacing))
     wanted = np.arange(count) * (at[-1] / count)
     return np.column_stack([np.interp(wanted, at, column) for column in closed.T])
 

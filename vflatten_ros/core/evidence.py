@@ -113,7 +113,8 @@ def _twice_area(uv: Float) -> float:
 
 def _cells(uv: Float, origin: Float) -> NDArray[np.int32]:
     """Image coordinates in sixteenths of a cell."""
-    return np.rint((uv - origin) / CELL_M * 16).astype(np.int32)
+    result: NDArray[np.int32] = np.rint((uv - origin) / CELL_M * 16).astype(np.int32)
+    return result
 
 
 def _gaps(points: FlatPoints, origin: Float, body: NDArray[np.uint8]) -> NDArray[np.uint8]:

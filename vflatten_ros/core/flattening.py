@@ -63,8 +63,8 @@ def _check(network: DistanceNetwork, count: int) -> None:
     if pieces > 1:
         largest = np.bincount(label).max()
         raise DisconnectedSurface(
-            f"the distances leave {pieces} pieces, the largest of {largest} of {count} points; give "
-            "corresponding points that join them"
+            f"the distances leave {pieces} pieces, the largest of {largest} of {count} points; "
+            "give corresponding points that join them"
         )
 
 
@@ -113,7 +113,7 @@ def _springs(
 def _majorize(
     network: DistanceNetwork, uv: Float, config: FlatteningConfig, progress: Progress
 ) -> Float:
-    """Stress majorisation (de Leeuw 1977) in rounds: weights are fixed and factored once a round."""
+    """Stress majorisation (de Leeuw 1977) in rounds: weights are fixed, factored once a round."""
     count = len(uv)
     for done in range(config.rounds):
         progress("flattening", done / config.rounds)
@@ -145,7 +145,8 @@ def _trust(network: DistanceNetwork, uv: Float, config: FlatteningConfig, done: 
     off = (length - _wanted(network, length)) / network.sigma_m
     cut = config.robust_sigmas * max(1.0, 8.0 / 2.0**done)
     weight = 1.0 / network.sigma_m**2
-    return weight / weight.max() / (1.0 + (off / cut) ** 2) ** 2
+    result: Float = weight / weight.max() / (1.0 + (off / cut) ** 2) ** 2
+    return result
 
 
 def _factored(network: DistanceNetwork, weight: Float, count: int) -> SuperLU:

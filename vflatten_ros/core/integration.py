@@ -135,7 +135,8 @@ def align(
 
 
 def _lag_weight(config: IntegrationConfig) -> float:
-    return 1.0 / np.radians(max(config.lag_deg, 1e-3)) ** 2
+    result: float = 1.0 / np.radians(max(config.lag_deg, 1e-3)) ** 2
+    return result
 
 
 def _surface_rows(goal: Float, normal: Float, point: Float) -> tuple[Float, Float, float, float]:
@@ -224,7 +225,8 @@ def _pieces(count: int, relations: Relations) -> Int:
     order = np.argsort(-np.bincount(label), kind="stable")
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    return rank[label]
+    result: Int = rank[label]
+    return result
 
 
 def network_of(joint: Joint, config: IntegrationConfig) -> DistanceNetwork:
@@ -263,7 +265,8 @@ def unknowns(count_a: int, count_b: int, at_a: Int, at_b: Int) -> Int:
     """
     number = np.arange(count_a + count_b)
     number[count_a + at_b] = at_a
-    return np.unique(number, return_inverse=True)[1].reshape(-1)
+    result: Int = np.unique(number, return_inverse=True)[1].reshape(-1)
+    return result
 
 
 def start_places(xy_a: Float, xy_b: Float, at_a: Int, at_b: Int) -> tuple[Float, Float]:

@@ -12,7 +12,7 @@ from vflatten_ros.core.config import MeasurementConfig
 from vflatten_ros.core.recognition import UNKNOWN, Recognition
 from vflatten_ros.core.template_fit import Fit, place
 from vflatten_ros.core.templates import Float
-from vflatten_ros.core.values import FlatPoints, Landmark, Measurement, Notice, Outline
+from vflatten_ros.core.values import FlatPoints, Int, Landmark, Measurement, Notice, Outline
 
 CELL_M = 0.01  # of the area counted as seen
 
@@ -86,7 +86,7 @@ def _seen(fit: Fit, name: str) -> bool:
     return any(_bounds_seen(fit, path) for path in fit.template.paths[name])
 
 
-def _bounds_seen(fit: Fit, path: Float, enough: float = 0.25) -> bool:
+def _bounds_seen(fit: Fit, path: Int, enough: float = 0.25) -> bool:
     """A size is bounded, at either end, by an edge across its direction there."""
     points = fit.points()
     ends = (
@@ -129,7 +129,7 @@ def covered(fit: Fit, points: FlatPoints) -> float:
 def landmarks(
     fit: Fit, points: FlatPoints, probability: float, config: MeasurementConfig
 ) -> tuple[Landmark, ...]:
-    """Every named point: its flat place from the fit, its hanging place from what was seen there."""
+    """Every named point: its flat place from the fit, its hanging place from what was seen."""
     placed, slope = place(fit.template, fit.pose, fit.state)
     variance = np.einsum("pim,mn,pin->pi", slope, fit.covariance, slope)
     sigma = np.sqrt(variance.mean(axis=1))
@@ -157,7 +157,7 @@ def _landmark(
     at: Float,
     sigma: float,
     points: FlatPoints,
-    near: Float,
+    near: Int,
     probability: float,
     config: MeasurementConfig,
 ) -> Landmark:

@@ -68,7 +68,8 @@ def _normalised(contour: Float) -> Float:
     """The contour with its centroid at 0 and a longest length of 1."""
     hull = cv2.convexHull(contour.astype(np.float32))[:, 0].astype(np.float64)
     longest = np.linalg.norm(hull[:, None] - hull[None], axis=-1).max()
-    return (contour - centroid(contour)) / max(longest, 1e-9)
+    result: Float = (contour - centroid(contour)) / max(longest, 1e-9)
+    return result
 
 
 def centroid(contour: Float) -> Float:

@@ -38,8 +38,8 @@ def observe(view: View, config: Config, progress: Progress) -> Observation:
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     pixel, shape = (view.pixel, view.shape) if view.shape[0] > 1 else (None, None)
     surface = fit_surface(points, config.surface, toward, pixel, shape, progress)
-    place, depth = surface.rays.to_grid(points)
-    place = np.rint(place).astype(np.int64)
+    at, depth = surface.rays.to_grid(points)
+    place: Int = np.rint(at).astype(np.int64)
     depth = depth - depth.min() + PARALLEL_M if surface.rays.parallel else depth
     cells, first, cell = np.unique(place, axis=0, return_index=True, return_inverse=True)
     found = find_patches(cells, depth[first], config.patches)
@@ -54,10 +54,10 @@ def observe(view: View, config: Config, progress: Progress) -> Observation:
 def edges(observation: Observation, uv: Float, step_m: float) -> Bool:
     """Points at which the item may end, once they are flattened; elsewhere it goes on unseen.
 
-    At an end of what is seen, the next cloth in the image tells: if it lies as far away in the plane as
-    in space, it is the far side of a hole in the data; if it is as near to the camera or nearer, and
-    lies elsewhere in the plane, it hides how the cloth goes on; otherwise the item may end there. Cloth
-    that turns away from the camera goes on, too.
+    At an end of what is seen, the next cloth in the image tells: if it lies as far away in the
+    plane as in space, it is the far side of a hole in the data; if it is as near to the camera or
+    nearer, and lies elsewhere in the plane, it hides how the cloth goes on; otherwise the item
+    may end there. Cloth that turns away from the camera goes on, too.
 
     Parameters
     ----------
@@ -80,7 +80,8 @@ def edges(observation: Observation, uv: Float, step_m: float) -> Bool:
     # the outline is ragged: single pixels face their neighbours along it
     around = cv2.boxFilter(balance, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
     hidden = around[tuple(observation.place.T)] > 0.5
-    return ~hidden & (observation.facing > GRAZING)
+    result: Bool = ~hidden & (observation.facing > GRAZING)
+    return result
 
 
 def _camera(view: View) -> Float:
@@ -104,8 +105,8 @@ def locate(observation: Observation, pixel: tuple[int, int], reach_px: int) -> i
     if away[nearest] > reach_px:
         row, col = view.pixel[nearest]
         raise InvalidCorrespondence(
-            f"corresponding point (row {pixel[0]}, col {pixel[1]}) of view {view.view_id} is not on "
-            f"the item; the item's nearest pixel is ({row}, {col})"
+            f"corresponding point (row {pixel[0]}, col {pixel[1]}) of view {view.view_id} is not "
+            f"on the item; the item's nearest pixel is ({row}, {col})"
         )
     if observation.patch[nearest] >= 0:
         return nearest
@@ -123,4 +124,5 @@ def quads(observation: Observation, keep: Bool) -> Int:
     corner = corner.reshape(-1, 4)
     corner = corner[(corner >= 0).all(axis=1)]
     patch = observation.fringe[corner]
-    return corner[(patch == patch[:, :1]).all(axis=1)]
+    result: Int = corner[(patch == patch[:, :1]).all(axis=1)]
+    return result

@@ -83,7 +83,8 @@ def _misfit_of_shifts(outline: Float, shape: tuple[int, ...], parts: list[Float]
 
 
 def _capped(distance: Float) -> Float:
-    return np.minimum(distance * CELL_M / CUT_M, 1.0) ** 2
+    result: Float = np.square(np.minimum(distance * CELL_M / CUT_M, 1.0))
+    return result
 
 
 def _spectrum(image: Float) -> Float:

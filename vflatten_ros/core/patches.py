@@ -38,7 +38,7 @@ class _Borders:
 class Patches:
     """Smooth patches of one view; n points."""
 
-    patch: Int  # (n,) number of the point's patch, largest first; -1: beside a step, or patch too small
+    patch: Int  # (n,) the point's patch, largest first; -1: beside a step, or patch too small
     fringe: (
         Int  # (n,) the same with the points between patches, which may be of the one or the other
     )

@@ -1,4 +1,4 @@
-"""Outline to category: eq. 11's model images, and the fit of every category's family of outlines."""
+"""Outline to category: eq. 11's model images, and the fit of each category's family of outlines."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _spread(evidence: Evidence, template: Template, pose: Float, state: Float) -
 
 def _edge_distances(evidence: Evidence, outline: Float) -> tuple[Float, Float]:
     samples = samples_per_edge(len(outline))
-    share = ((np.arange(samples) + 0.5) / samples)[:, None]
+    share: Float = ((np.arange(samples) + 0.5) / samples)[:, None]
     at = outline[:, None] * (1 - share) + np.roll(outline, -1, axis=0)[:, None] * share
     distance, _, seen = look_up(evidence, at)
     return distance, seen

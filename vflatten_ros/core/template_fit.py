@@ -44,7 +44,7 @@ class Fit:
 
 
 def place(template: Template, pose: Float, state: Float) -> tuple[Float, Float]:
-    """Points of the template in the flat frame, (..., p, 2), and their slope, (..., p, 2, 3 + m)."""
+    """Template points in the flat frame, (..., p, 2), and their slope, (..., p, 2, 3 + m)."""
     local, by_state = template.place(state)
     cos, sin = np.cos(pose[..., 0]), np.sin(pose[..., 0])
     turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)[..., None, :, :]
@@ -176,7 +176,10 @@ def _rows(edge: Int, along: Float, direction: Float, moves: Float) -> Float:
     start, end = moves[batch, edge], moves[batch, (edge + 1) % moves.shape[1]]
     start_part = direction * (along - 1.0)[..., None]
     end_part = direction * -along[..., None]
-    return np.einsum("bni,bnim->bnm", start_part, start) + np.einsum("bni,bnim->bnm", end_part, end)
+    result: Float = np.einsum("bni,bnim->bnm", start_part, start) + np.einsum(
+        "bni,bnim->bnm", end_part, end
+    )
+    return result
 
 
 def _seen_on_template(
@@ -211,9 +214,9 @@ def _template_on_seen(
 ) -> tuple[Float, Float, Float, Float]:
     b, k = outline.shape[:2]
     samples = samples_per_edge(k)
-    share = (np.arange(samples) + 0.5) / samples
+    share: Float = (np.arange(samples) + 0.5) / samples
     after, after_moves = np.roll(outline, -1, axis=1), np.roll(moves, -1, axis=1)
-    place_ = outline[:, :, None] * (1 - share)[:, None] + after[:, :, None] * share[:, None]
+    place_: Float = outline[:, :, None] * (1 - share)[:, None] + after[:, :, None] * share[:, None]
     length = np.linalg.norm(after - outline, axis=-1)
     distance, slope, seen = look_up(evidence, place_.reshape(b, k * samples, 2))
     slope = slope.reshape(b, k, samples, 2)

@@ -136,10 +136,10 @@ class Template:
         points, slope = self.place(self.at_rest(state))
         slope[..., len(self.sizes) + len(self.parts) :] = 0.0
         found = {name: _path(paths[0], points, slope) for name, paths in self.paths.items()}
-        values = sorted((found[name] for name in self.order), key=lambda pair: pair[0])
-        found.update(zip(self.order, values))
+        values = sorted((found[name] for name in self.order), key=lambda pair: float(pair[0]))
+        found.update(zip(self.order, values, strict=True))
         return {
-            name: (value, float(np.sqrt(max(row @ covariance @ row, 0.0))))
+            name: (value, float(np.sqrt(max(float(row @ covariance @ row), 0.0))))
             for name, (value, row) in found.items()
         }
 

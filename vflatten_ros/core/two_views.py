@@ -1,9 +1,9 @@
 """The paper's method: two views and a few corresponding points (Kita & Kita 2019, section 3).
 
-With evidence 'boundary' it is the paper's: boundary points, geodesic lines between points of similar
-height, the straight distance to the next and second-next boundary point, and nothing else. With
-'surface' the cloth between the boundaries counts too: samples of every smooth patch are related to
-their neighbours, and the views are joined by all cloth that both show.
+With evidence 'boundary' it is the paper's: boundary points, geodesic lines between points of
+similar height, the straight distance to the next and second-next boundary point, and nothing else.
+With 'surface' the cloth between the boundaries counts too: samples of every smooth patch are
+related to their neighbours, and the views are joined by all cloth that both show.
 """
 
 from __future__ import annotations
@@ -125,8 +125,8 @@ def _observe_pair(
     keep = consistent_pairs(a.surface.points[at_a], b.surface.points[at_b], config.integration)
     if keep.sum() < 2:
         raise InvalidCorrespondence(
-            f"the {len(keep)} corresponding points contradict one another: at most {keep.sum()} can "
-            "be points of one item that hangs still; check them"
+            f"the {len(keep)} corresponding points contradict one another: at most {keep.sum()} "
+            "can be points of one item that hangs still; check them"
         )
     notices = tuple(_rejected(c) for c, kept in zip(given, keep, strict=True) if not kept)
     used = tuple(c for c, kept in zip(given, keep, strict=True) if kept)
@@ -135,8 +135,8 @@ def _observe_pair(
 
 def _rejected(pair: Correspondence) -> Notice:
     text = (
-        f"view {pair.view_a} pixel {pair.pixel_a} and view {pair.view_b} pixel {pair.pixel_b} are not "
-        "the same point of the item, if the other corresponding points are right; left out"
+        f"view {pair.view_a} pixel {pair.pixel_a} and view {pair.view_b} pixel {pair.pixel_b} are "
+        "not the same point of the item, if the other corresponding points are right; left out"
     )
     return Notice("correspondence_rejected", text)
 
@@ -146,8 +146,9 @@ def _two_views(views: Sequence[View], given: Sequence[Correspondence]) -> tuple[
         raise NotEnoughViews(f"the two-view method needs two views, got {len(views)}")
     if len(given) < 2:
         raise InvalidCorrespondence(
-            f"the two-view method needs two corresponding points or more (the paper: three to five), got "
-            f"{len(given)}; give them with --protocol or the add_correspondences service"
+            "the two-view method needs two corresponding points or more (the paper: three to "
+            f"five), got {len(given)}; give them with --protocol or by the service "
+            "add_correspondences"
         )
     named = sorted({c.view_a for c in given} | {c.view_b for c in given})
     by_id = {view.view_id: view for view in views}
@@ -208,8 +209,8 @@ def _half_pixel(pair: _Pair) -> float:
 def _pieces_to_place(joint: Joint, count_a: int, pairs: int) -> list[int]:
     """The largest piece, which must hold cloth of both views, and others with corresponding points.
 
-    Corresponding points are on the side of the item that is to be flattened; a piece without any may
-    be of the other side, or the inside.
+    Corresponding points are on the side of the item that is to be flattened; a piece without any
+    may be of the other side, or the inside.
     """
     main = joint.piece == 0
     if not (main[:count_a].any() and main[count_a:].any()):

@@ -145,11 +145,14 @@ def _carried(vector: Float, start: Float, end: Float) -> Float:
     axis = np.cross(start, end)
     cos = _dot(start, end)[:, None]
     spin = np.cross(axis, vector)
-    return vector * cos + spin + axis * (_dot(axis, vector)[:, None] / np.maximum(1 + cos, 1e-9))
+    result: Float = (
+        vector * cos + spin + axis * (_dot(axis, vector)[:, None] / np.maximum(1 + cos, 1e-9))
+    )
+    return result
 
 
 def _laplacian(
-    count: int, relations: Relations, weight: Float, turn: Complex | Float
+    count: int, relations: Relations, weight: Float, turn: Complex | Float | float
 ) -> csc_matrix:
     """Hermitian matrix of sum w |x_j - turn x_i|^2, slightly raised so that it can be inverted."""
     i, j = relations.i, relations.j
@@ -167,7 +170,7 @@ def _factored(matrix: csc_matrix) -> SuperLU:
 
 
 def _angles(count: int, relations: Relations, weight: Float) -> Complex:
-    """Frames of the plane that agree best with the turns: the lowest eigenvector, by power steps."""
+    """Frames of the plane that agree best with the turns: lowest eigenvector, by power steps."""
     solver = _factored(_laplacian(count, relations, weight, relations.turn))
     frame = np.ones(count, dtype=complex)
     for _ in range(30):
@@ -188,10 +191,11 @@ def _places(count: int, relations: Relations, frame: Complex, weight: Float) -> 
     solver = _factored(_laplacian(count, relations, weight, 1.0))
     solved = solver.solve(np.stack([right.real, right.imag], axis=1))
     place: Complex = solved[:, 0] + 1j * solved[:, 1]
-    return place - place.mean()
+    result: Complex = place - place.mean()
+    return result
 
 
-def _summed(count: int, at: Int, values: Complex) -> Complex:
+def _summed(count: int, at: Int, values: Complex | Float) -> Complex:
     real = np.bincount(at, values.real, count)
     return real + 1j * np.bincount(at, values.imag, count)
 
@@ -204,7 +208,7 @@ def _misfit(relations: Relations, place: Complex, frame: Complex) -> Float:
 
 
 def _turned(relations: Relations, place: Complex, frame: Complex, weight: Float) -> Complex:
-    """Frames that fit the present places best; the turns to their neighbours decide where none do."""
+    """Frames that fit the present places best; the turns to neighbours decide where none do."""
     i, j, turn = relations.i, relations.j, relations.turn
     step = place[j] - place[i]
     count = len(place)

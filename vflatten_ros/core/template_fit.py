@@ -216,7 +216,8 @@ def _template_on_seen(
     samples = samples_per_edge(k)
     share: Float = (np.arange(samples) + 0.5) / samples
     after, after_moves = np.roll(outline, -1, axis=1), np.roll(moves, -1, axis=1)
-    place_: Float = outline[:, :, None] * (1 - share)[:, None] + after[:, :, None] * share[:, None]
+    ahead: Float = share[:, None]
+    place_: Float = (1.0 - ahead) * outline[:, :, None] + ahead * after[:, :, None]
     length = np.linalg.norm(after - outline, axis=-1)
     distance, slope, seen = look_up(evidence, place_.reshape(b, k * samples, 2))
     slope = slope.reshape(b, k, samples, 2)

@@ -216,8 +216,8 @@ def _template_on_seen(
     samples = samples_per_edge(k)
     share: Float = (np.arange(samples) + 0.5) / samples
     after, after_moves = np.roll(outline, -1, axis=1), np.roll(moves, -1, axis=1)
-    ahead: Float = share[:, None]
-    place_: Float = (1.0 - ahead) * outline[:, :, None] + ahead * after[:, :, None]
+    start: Float = outline[:, :, None]
+    place_ = start + share[:, None] * (after[:, :, None] - start)
     length = np.linalg.norm(after - outline, axis=-1)
     distance, slope, seen = look_up(evidence, place_.reshape(b, k * samples, 2))
     slope = slope.reshape(b, k, samples, 2)

@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
 """How far results are from the truth of simulated recordings: writes docs/accuracy.md.
 
-    accuracy.py [FOLDER ...] [--protocol] [--calibration-error] [--output FILE]
+    accuracy.py [FOLDER ...] [--runs rotation,protocol,calibration] [--output FILE]
 
 Each FOLDER is a recording with truth.json and truth.npz, or holds such recordings (default: bags/).
-The truth is read only after the result is there, to compare.
+Every recording is flattened with all views and no manual input (rotation), by the paper's protocol
+(protocol), and with all views and a calibration that is off (calibration). The truth is read only
+after the result is there, to compare.
 """
 
 from __future__ import annotations
@@ -35,7 +37,12 @@ from vflatten_ros.results import garment_result
 Float = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent
 PIXEL_M = 0.002  # raster of the overlap
-AXIS_SHIFT_M, AXIS_TILT_RAD = 0.003, np.radians(0.5)  # of --calibration-error
+AXIS_SHIFT_M, AXIS_TILT_RAD = 0.003, np.radians(0.5)  # of the calibration that is off
+RUNS = {
+    "rotation": "All views, no manual input (`method: rotation`)",
+    "protocol": "The paper's protocol: two views, three to five points (`method: kita2019`)",
+    "calibration": "All views, the calibrated axis 3 mm and 0.5 degrees off",
+}
 FAILED_SIZE_PCT = 7.0  # a size further off than this is drawn
 
 HEAD = """# Accuracy
@@ -80,21 +87,24 @@ def main() -> int:
     """Replay, compare, write the page."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folders", type=Path, nargs="*", default=[ROOT / "bags"])
-    parser.add_argument("--protocol", action="store_true", help="the paper's two views and points")
     parser.add_argument(
-        "--calibration-error", action="store_true", help="axis 3 mm and 0.5 degrees off"
+        "--runs", default=",".join(RUNS), help="some of rotation,protocol,calibration"
     )
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "accuracy.md")
     args = parser.parse_args()
-    pictures = args.output.with_suffix("")
-    rows = []
-    for folder in recordings(args.folders):
-        print(folder.name, file=sys.stderr)
-        rows.append(compare(folder, args.protocol, args.calibration_error, pictures))
-    if not rows:
+    runs = args.runs.split(",")
+    if not set(runs) <= set(RUNS):
+        parser.error(f"--runs: expected some of {','.join(RUNS)}, got {args.runs}")
+    folders = list(recordings(args.folders))
+    if not folders:
         print("accuracy: no recording with truth.json in the folders given", file=sys.stderr)
         return 1
-    args.output.write_text(page(rows, args, pictures.name), encoding="utf-8")
+    parts = [HEAD]
+    for run in runs:
+        pictures = args.output.with_suffix("") / run
+        rows = [row for folder in folders if (row := compare(folder, run, pictures))]
+        parts += section(RUNS[run], rows, f"{pictures.parent.name}/{run}")
+    args.output.write_text("\n".join(parts), encoding="utf-8")
     print(args.output)
     return 0
 
@@ -108,18 +118,21 @@ def recordings(folders: Sequence[Path]) -> Iterator[Path]:
             yield from sorted(path.parent for path in folder.glob("*/truth.json"))
 
 
-def compare(folder: Path, protocol: bool, off: bool, pictures: Path) -> Row:
-    """Flatten one recording, then read its truth."""
+def compare(folder: Path, run: str, pictures: Path) -> Row | None:
+    """Flatten one recording, then read its truth; None where the run has no input for it."""
+    protocol = folder / "protocol.json" if run == "protocol" else None
+    if protocol and "views" not in json.loads(protocol.read_text(encoding="utf-8")):
+        return None
+    print(f"{run}: {folder.name}", file=sys.stderr)
     config = dataclasses.replace(Config(), method="kita2019" if protocol else "rotation")
     started = time.perf_counter()
     result: dict[str, Any] = {}
     notes: list[str] = []
     replayed = None
     with tempfile.TemporaryDirectory() as scratch:
-        calibration = misplaced(folder, Path(scratch)) if off else None
-        given = folder / "protocol.json" if protocol else None
+        calibration = misplaced(folder, Path(scratch)) if run == "calibration" else None
         try:
-            replayed = replay_recording(folder, config, calibration=calibration, protocol=given)
+            replayed = replay_recording(folder, config, calibration=calibration, protocol=protocol)
             result = garment_result(replayed.garment, replayed.views)
             notes += [notice["code"] for notice in result["notices"]]
         except VFlattenError as error:
@@ -236,21 +249,14 @@ def landmark_error(truth: Mapping[str, Any], result: Mapping[str, Any]) -> float
     return min(medians, default=None)
 
 
-def page(rows: Sequence[Row], args: argparse.Namespace, pictures: str) -> str:
-    """Text of the page."""
-    how = [
-        "The paper's two views and corresponding points, `method: kita2019`."
-        if args.protocol
-        else "All views, no manual input, `method: rotation`."
-    ]
-    if args.calibration_error:
-        how.append("The calibration's axis was moved by 3 mm and tilted by 0.5 degrees.")
-    lines = [HEAD, " ".join(how), "", *table(rows), "", *figures_of_merit(rows), ""]
+def section(title: str, rows: Sequence[Row], pictures: str) -> list[str]:
+    """One run: its table, its figures of merit, and what failed."""
+    lines = [f"## {title}", "", *table(rows), "", *figures_of_merit(rows), ""]
     for row in (row for row in rows if row.failed):
-        lines += [f"## {row.name}", "", "; ".join(row.notes) or "no notice", ""]
+        lines += [f"**{row.name}**: " + ("; ".join(row.notes) or "no notice"), ""]
         if row.category != "failed":
             lines += [f"![flattened {row.name}]({pictures}/{row.name}.png)", ""]
-    return "\n".join(lines)
+    return lines
 
 
 def table(rows: Sequence[Row]) -> list[str]:

@@ -29,6 +29,7 @@ sys.path[:0] = [str(ROOT / "test"), str(ROOT), str(ROOT / "benchmarks")]
 
 import peers
 import synthetic
+from recorded import recorded
 from report import INTRO, NEEDED, cell, machine, row, say, summary, table_head
 from synthetic import Patch
 
@@ -414,6 +415,7 @@ def main() -> None:
     found, lines = speed(options.quick)
     keys |= found
     body += lines
+    body += recorded(ROOT / "bags", options.quick)
     ordered = {name: keys[name] for name in NEEDED}
     report = "\n".join([*summary(ordered), *body, ""])
     print(report)

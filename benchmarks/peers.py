@@ -40,19 +40,25 @@ def grid_mesh(patch: Patch, points: Float, smooth: bool = True, jump_m: float = 
         xyz[..., 2] = quadratic_image(xyz[..., 2], patch.mask, patch.mask, SMOOTHING_M / step)[0][
             ..., 0
         ]
-    full = _full_squares(xyz[..., 2], patch.mask, jump_m)
-    number = np.arange(patch.mask.size).reshape(patch.mask.shape)
+    return mesh_of(xyz, patch.mask, jump_m, time.process_time() - start)
+
+
+def mesh_of(xyz: Float, mask: NDArray[np.bool_], jump_m: float, seconds: float) -> Mesh:
+    """Mesh of (rows, cols, 3) points; `seconds` were spent before."""
+    start = time.process_time()
+    full = _full_squares(xyz[..., 2], mask, jump_m)
+    number = np.arange(mask.size).reshape(mask.shape)
     a, b, c, d = (
         n[full] for n in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1])
     )
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    faces = _largest(faces, patch.mask.size)
+    faces = _largest(faces, mask.size)
     used = np.unique(faces)
-    vertex = np.full(patch.mask.size, -1)
+    vertex = np.full(mask.size, -1)
     vertex[used] = np.arange(len(used))
     vertices = np.ascontiguousarray(xyz.reshape(-1, 3)[used])
-    seconds = time.process_time() - start
-    return Mesh(vertices, vertex[faces], vertex[patch.mask.ravel()], seconds)
+    seconds += time.process_time() - start
+    return Mesh(vertices, vertex[faces], vertex[mask.ravel()], seconds)
 
 
 def _full_squares(z: Float, mask: NDArray[np.bool_], jump_m: float) -> NDArray[np.bool_]:

@@ -44,6 +44,14 @@ def slope_at(fit: Float, offset: Float) -> Float:
     return np.stack([by_row, by_col], axis=-1)
 
 
+def moved_by(fit: Float, offset: Float) -> Float:
+    """The same surfaces as (..., 6) fits at (..., 2) grid steps from their places."""
+    out = fit.copy()
+    out[..., 0] = value_at(fit, offset)
+    out[..., 1:3] = slope_at(fit, offset)
+    return out
+
+
 def quadratic_image(depth: Float, seen: Bool, where: Bool, width: float) -> tuple[Float, Float]:
     """Gaussian-weighted quadratic of the depth image by separable sums.
 

@@ -18,6 +18,7 @@ from vflatten_ros.core.raygrid import RayGrid
 from vflatten_ros.core.rulings import average_along_rulings
 from vflatten_ros.core.smoothing import (
     fill_holes,
+    moved_by,
     noise_inflation,
     plane_fits,
     quadratic_image,
@@ -29,6 +30,7 @@ from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 from vflatten_ros.core.weighted_planes import linear_fit, view_frame
 
 CHUNK = 4000  # places fitted at a time, so that the arrays stay in the cache
+STEEPEST = 6.0  # grid steps deep for one across: 80 degrees from the view
 REACH = 5  # grid steps to each side in a fit in the tangent frame
 
 
@@ -104,6 +106,7 @@ def fit_surface(
         fits = _linear_fits(points, toward, rays, layers, measured, fits, cell, config.radius_m)
     else:
         _refit(rays, layers, measured, special, width * cell, fits, gain)
+        _mend_cliffs(layers, fits, cell)
         variance = noise**2 * gain * noise_inflation(image - fits[..., 0], seen, width)
         if config.along_rulings:
             fits, variance = average_along_rulings(fits, variance, layers, cell, width * cell)
@@ -139,6 +142,32 @@ def _special(layers: Layers, fits: Float, cell: float, reach: int) -> Bool:
     cut[:-1] |= layers.valid[:-1] & layers.valid[1:] & ~layers.smooth_down[:-1]
     steep = np.hypot(fits[..., 1], fits[..., 2]) > 1.7 * cell
     return np.asarray(layers.valid & ~layers.bridged & (maximum_filter(cut, 2 * reach + 1) | steep))
+
+
+def _mend_cliffs(layers: Layers, fits: Float, cell: float) -> None:
+    """Where a fit mixes two layers, put the gentlest fit that it is joined to.
+
+    Such a fit is steeper than 80 degrees and does not meet those of its neighbours half way.
+    """
+    steepness = np.hypot(fits[..., 1], fits[..., 2]) / cell
+    wild = np.zeros(steepness.shape, bool)
+    gentlest = np.full(steepness.shape, STEEPEST)
+    mended = fits.copy()
+    right, down = layers.right[:, :-1], layers.down[:-1]
+    for tied, here, there, to in (
+        (right, np.s_[:, :-1], np.s_[:, 1:], (0, 1)),
+        (right, np.s_[:, 1:], np.s_[:, :-1], (0, -1)),
+        (down, np.s_[:-1], np.s_[1:], (1, 0)),
+        (down, np.s_[1:], np.s_[:-1], (-1, 0)),
+    ):
+        way = np.array(to, float)
+        apart = np.abs(value_at(fits[here], way / 2) - value_at(fits[there], -way / 2)) > cell
+        wild[here] |= tied & apart & (steepness[here] > STEEPEST)
+        better = tied & (steepness[there] < gentlest[here])
+        gentlest[here][better] = steepness[there][better]
+        mended[here][better] = moved_by(fits[there][better], -way)
+    put = wild & (gentlest < STEEPEST)
+    fits[put] = mended[put]
 
 
 def _refit(

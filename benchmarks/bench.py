@@ -8,26 +8,25 @@ view beside that at the smallest size.
 # ruff: noqa: E402  (threads must be limited before numpy is imported)
 from __future__ import annotations
 
-import os
-
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_name] = "1"
-
-import argparse
-import json
-import platform
 import sys
-import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
-
-import cv2
-import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "test"), str(ROOT)]
 
+from vflatten_ros import threads
+
+threads.use_one()
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import cv2
+import numpy as np
 import synthetic
 
 from vflatten_ros.bag import gather_views, open_recording

@@ -8,27 +8,26 @@ fewer surfaces and pairs and leaves docs/benchmarks.md alone. One thread; times 
 # ruff: noqa: E402  (threads must be limited before numpy is imported)
 from __future__ import annotations
 
-import os
-
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_name] = "1"
-
-import argparse
-import json
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "test"), str(ROOT), str(ROOT / "benchmarks")]
 
+from vflatten_ros import threads
+
+threads.use_one()
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 import peers
 import synthetic
+from numpy.typing import NDArray
 from recorded import recorded
 from report import INTRO, NEEDED, cell, machine, row, say, summary, table_head
 from synthetic import Patch

@@ -25,6 +25,13 @@ SHORTEST_M, LONGEST_M = 0.05, 0.4
 SEEN_M = 0.004  # a straight flat line is seen if every part of it is nearer to seen cloth
 JUMP_M = 0.015  # neighbours farther apart in depth are not joined by the peers' mesh
 PIXEL_M = 0.0025  # at the item, for the peers' smoothing
+ABOUT = f"""
+Every fourth view; pairs of {100 * SHORTEST_M:.0f} to {100 * LONGEST_M:.0f} cm on the outside of
+one panel whose straight line on the flat item lies within {1e3 * SEEN_M:.0f} mm of seen points. The
+simulation's truth chooses and judges the pairs, no more. What is wrong and not flagged either goes
+on to a fold that touches the first, less than 3 mm in front of the other, or ends where the cloth
+is seen at a grazing angle.
+"""
 
 
 def recorded(bags: Path, quick: bool) -> list[str]:
@@ -55,7 +62,7 @@ def recorded(bags: Path, quick: bool) -> list[str]:
                 ]
             )
         )
-    return lines
+    return [*lines, ABOUT]
 
 
 def _views(folder: Path) -> tuple[View, ...]:

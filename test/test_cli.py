@@ -131,6 +131,23 @@ def test_same_input_gives_the_same_bytes(outputs):
     assert first == second
 
 
+def test_a_rotation_gives_the_same_bytes_whatever_the_threads(tmp_path):
+    """BLAS splits its sums by the number of threads, by default that of the machine's cores."""
+    views = ",".join(map(str, range(0, 24, 2)))
+    results = []
+    for threads in ("1", "3"):
+        out = tmp_path / f"{threads}.json"
+        many = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), threads)
+        run = vflatten(
+            *("replay", BAG, "--method", "rotation", "--views", views, "--json", out, "--quiet"),
+            env=os.environ | many,
+        )
+        assert run.returncode == 0, run.stderr
+        lines = out.read_text().splitlines()
+        results.append([line for line in lines if not line.startswith(' "timing_s"')])
+    assert results[0] == results[1]
+
+
 def test_the_table_says_what_was_found_used_and_dropped(outputs):
     run, _ = outputs[0]
     expected = (

@@ -16,7 +16,7 @@ from importlib import import_module, metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vflatten_ros import resources
+from vflatten_ros import resources, threads
 from vflatten_ros.core.config import METHODS, Config
 from vflatten_ros.core.errors import VFlattenError
 from vflatten_ros.progress import Stages
@@ -30,6 +30,7 @@ PASSED_ON = {"node": "vflatten_ros.node", "play": "vflatten_ros.player"}
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; gives the exit code."""
+    threads.use_one()
     arguments = list(sys.argv[1:] if argv is None else argv)
     _forgive(sys.stdout, sys.stderr)
     try:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib import import_module
+from typing import Any
 
-from vflatten_ros import displays, messages
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import FlatGarment, Progress, View
-from vflatten_ros.picture import draw_flat
+from vflatten_ros.messages import fill
+from vflatten_ros.outputs import result_messages
 from vflatten_ros.worker import Job, Work
 
 
@@ -39,22 +41,17 @@ def flatten(
 
 def serialized(garment: FlatGarment, views: Sequence[View]) -> dict[str, bytes]:
     """Every message of a result, serialized: filling them would hold up the node's callbacks."""
-    from geometry_msgs.msg import PolygonStamped
     from rclpy.serialization import serialize_message
-    from sensor_msgs.msg import Image, PointCloud2
-    from visualization_msgs.msg import MarkerArray
 
-    from vflatten_ros.msg import FlattenedView, GarmentEstimate
-
-    filled = {
-        "flattened_view": (FlattenedView, messages.flattened_view_fields(garment, views)),
-        "garment": (GarmentEstimate, messages.garment_estimate_fields(garment, views)),
-        "contour": (PolygonStamped, displays.contour_fields(garment)),
-        "markers": (MarkerArray, displays.marker_fields(garment, views)),
-        "image": (Image, displays.image_fields(draw_flat(garment), garment.stamp_ns)),
-        "points": (PointCloud2, displays.points_fields(garment, views)),
-    }
     return {
-        topic: bytes(serialize_message(messages.fill(kind(), fields)))
-        for topic, (kind, fields) in filled.items()
+        message.topic.rpartition("/")[2]: bytes(
+            serialize_message(fill(_class_of(message.type)(), message.fields))
+        )
+        for message in result_messages(garment, views)
     }
+
+
+def _class_of(name: str) -> Any:
+    """The class of "package/Message"."""
+    package, message = name.split("/")
+    return getattr(import_module(f"{package}.msg"), message)

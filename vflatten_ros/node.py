@@ -1,6 +1,11 @@
 """Runs the node: `vflatten node`, `ros2 run vflatten_ros vflatten_node`."""
 
+# ruff: noqa: E402  (threads must be limited before numpy is imported)
 from __future__ import annotations
+
+from vflatten_ros import threads
+
+threads.use_one()  # the flattening process inherits it
 
 import argparse
 import signal

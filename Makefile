@@ -34,10 +34,10 @@ check: bootstrap  ## Lint and types
 format: bootstrap  ## Rewrite the code the way `make check` wants it
 	@$(IN_ENV) ruff check --fix --exit-zero; ruff format
 
-bench: bootstrap  ## Time our stages (ARGS="--save a.json" or "--compare a.json b.json")
+bench: bootstrap  ## Time our stages over sizes (ARGS="--save a.json", "--compare a.json b.json", --docs)
 	@$(IN_ENV) python benchmarks/bench.py $(ARGS)
 
-bench-peers: build/peers/ready  ## Against other libraries: docs/benchmarks.md (QUICK=1: under a minute)
+bench-peers: build/peers/ready  ## Beside other libraries: docs/benchmarks.md (QUICK=1: under a minute)
 	@PYTHONPATH=. build/peers/bin/python benchmarks/bench_peers.py $(if $(QUICK),--quick) $(ARGS)
 
 reproduce: bootstrap  ## The paper's experiments: docs/reproduction.md

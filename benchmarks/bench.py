@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Times of our stages over sizes: `--save FILE`, or `--compare OLD NEW` of two saved runs.
 
-CPU seconds of one thread, the best of some runs; "growth" is the cost of one more point, line or
-view beside that at the smallest size.
+CPU seconds of one thread, the best of some runs; "growth" is the cost of each point, line or view
+beside that at the smallest size. `--docs` writes the part of docs/benchmarks.md about it.
 """
 
 # ruff: noqa: E402  (threads must be limited before numpy is imported)
@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "test"), str(ROOT)]
+sys.path[:0] = [str(ROOT / "test"), str(ROOT), str(ROOT / "benchmarks")]
 
 from vflatten_ros import threads
 
@@ -22,12 +22,14 @@ import argparse
 import json
 import platform
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import synthetic
+from cost_page import write_page
 
 from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.categories import load_templates
@@ -38,8 +40,10 @@ from vflatten_ros.core.pipeline import flatten_garment
 from vflatten_ros.core.pointcloud import FLOAT32, PointField, decode_cloud
 from vflatten_ros.core.segmentation import make_view
 from vflatten_ros.core.surface import fit_surface
+from vflatten_ros.core.values import View
 from vflatten_ros.files import calibration_beside, load_calibration
 
+NOISE_M = 0.0005  # of repeated views
 Job = tuple[str, int, Callable[[], Any]]  # stage, size, what to run
 FIELDS = [PointField(name, 4 * i, FLOAT32, 1) for i, name in enumerate("xyz")]
 
@@ -49,7 +53,7 @@ def segmentation_jobs(recording: Path) -> Iterator[Job]:
     calibration = load_calibration(calibration_beside(recording))
     first = next(m for m in open_recording(recording).messages() if hasattr(m, "decode"))
     xyz = first.decode().xyz
-    for width in (360, 640, 960):
+    for width in (150, 360, 640, 960):
         rows = round(width * xyz.shape[0] / xyz.shape[1])
         data = cv2.resize(xyz, (width, rows), interpolation=cv2.INTER_LINEAR).tobytes()
 
@@ -105,21 +109,36 @@ def line_jobs() -> Iterator[Job]:
     yield "200 lines with the surface fit, points", len(points), both
 
 
-def view_jobs(recording: Path) -> Iterator[Job]:
-    """The whole method, over views."""
-    config = Config()
-    calibration = load_calibration(calibration_beside(recording))
-    templates = load_templates()
-    views = gather_views(open_recording(recording), calibration, config).views()
-    for count in (12, 24, 50, 100):
-        if count > len(views):
-            return
-        pick = [views[int(i)] for i in np.linspace(0, len(views), count, endpoint=False)]
+def view_jobs(recording: Path, rotations: Sequence[Path], quick: bool) -> Iterator[Job]:
+    """The whole method, over views: of several recordings, or of one, some of them or repeated."""
+    config, templates = Config(), load_templates()
+    views = _views(recording, config)
+    half = [views[i] for i in range(0, len(views), 2)]
+    several = [_views(path, config) for path in rotations]
+    if not several:
+        several = [half] + ([] if quick else [_repeated(views, times) for times in (2, 4)])
+    for chosen in sorted([views, *several], key=len):
         yield (
             "views to flattened item, views",
-            count,
-            lambda p=pick: flatten_garment(p, (), templates, config),
+            len(chosen),
+            lambda v=chosen: flatten_garment(v, (), templates, config),
         )
+
+
+def _views(recording: Path, config: Config) -> list[View]:
+    calibration = load_calibration(calibration_beside(recording))
+    return list(gather_views(open_recording(recording), calibration, config).views())
+
+
+def _repeated(views: list[View], times: int) -> list[View]:
+    """The views several times over, the copies with noise of their own along the rays."""
+    random = np.random.default_rng(0)
+    out = list(views)
+    for view in views * (times - 1):
+        ray = view.points_rig / np.linalg.norm(view.points_rig, axis=1, keepdims=True)
+        noise = random.normal(0.0, NOISE_M, (len(ray), 1))
+        out.append(replace(view, view_id=len(out), points_rig=view.points_rig + noise * ray))
+    return out
 
 
 def measure(run: Callable[[], Any]) -> float:
@@ -135,10 +154,15 @@ def measure(run: Callable[[], Any]) -> float:
     return float(best)
 
 
-def collect(recording: Path, quick: bool) -> dict[str, dict[str, float]]:
+def collect(recording: Path, rotations: Sequence[Path], quick: bool) -> dict[str, dict[str, float]]:
     """Stage -> size -> seconds, printed as they come."""
     found: dict[str, dict[str, float]] = {}
-    sources = (segmentation_jobs(recording), surface_jobs(quick), line_jobs(), view_jobs(recording))
+    sources = (
+        segmentation_jobs(recording),
+        surface_jobs(quick),
+        line_jobs(),
+        view_jobs(recording, rotations, quick),
+    )
     print(f"{'stage':44} {'size':>9} {'s':>8} {'us each':>9} {'growth':>7}")
     for source in sources:
         for stage, size, run in source:
@@ -168,12 +192,21 @@ def main() -> None:
     parser.add_argument("--save", type=Path, help="write the times to this file")
     parser.add_argument("--compare", type=Path, nargs=2, metavar=("OLD", "NEW"))
     parser.add_argument("--recording", type=Path, default=ROOT / "bags" / "LS1_1")
+    parser.add_argument(
+        "--rotations", type=Path, nargs="+", default=[], metavar="DIR",
+        help="recordings with other numbers of views, in place of the one's views repeated",
+    )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="leave the largest sizes out")
+    parser.add_argument("--docs", action="store_true", help="write docs/benchmarks.md")
     options = parser.parse_args()
     if options.compare:
         compare(*options.compare)
         return
-    found = collect(options.recording, options.quick)
+    found = collect(options.recording, options.rotations, options.quick)
+    if options.docs:
+        docs = ROOT / "docs"
+        picture = docs / "figures" / "cost.png"
+        write_page(found, docs / "benchmarks.md", picture, not options.rotations)
     if options.save:
         host = f"Python {platform.python_version()}, numpy {np.__version__}, {platform.machine()}"
         options.save.write_text(json.dumps({"host": host, "seconds": found}, indent=1) + "\n")

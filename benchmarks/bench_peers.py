@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
 """Ours beside what one would pick instead, on surfaces whose exact answer is known.
 
-Writes docs/benchmarks.md and build/bench-peers.json. Run by `make bench-peers`; `--quick` takes
-fewer surfaces and pairs and leaves docs/benchmarks.md alone. One thread; times are CPU seconds.
+Writes its part of docs/benchmarks.md and build/bench-peers.json. Run by `make bench-peers`;
+`--quick` takes fewer surfaces and pairs and leaves docs/benchmarks.md alone. One thread; times are
+CPU seconds.
 """
 
 # ruff: noqa: E402  (threads must be limited before numpy is imported)
@@ -29,7 +30,7 @@ import peers
 import synthetic
 from numpy.typing import NDArray
 from recorded import recorded
-from report import INTRO, NEEDED, cell, machine, row, say, summary, table_head
+from report import INTRO, NEEDED, TITLE, cell, machine, row, say, summary, table_head, write_part
 from synthetic import Patch
 
 from vflatten_ros.core.config import GeodesicConfig, SurfaceConfig
@@ -422,7 +423,8 @@ def main() -> None:
     target.parent.mkdir(exist_ok=True)
     target.write_text(json.dumps(ordered, indent=1) + "\n")
     if not options.quick:
-        (ROOT / "docs" / "benchmarks.md").write_text(f"{INTRO}\n{machine()}\n{report}")
+        page = ROOT / "docs" / "benchmarks.md"
+        write_part(page, TITLE, f"{INTRO}\n{machine()}\n{report}")
     say(f"{target} written after {time.time() - start:.0f} s")
 
 

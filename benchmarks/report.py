@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 import platform
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,15 @@ def table_head(title: str, columns: list[str]) -> list[str]:
 
 def row(cells: list[Any]) -> str:
     return "| " + " | ".join(str(c) for c in cells) + " |"
+
+
+def write_part(page: Path, title: str, text: str) -> None:
+    """Replace the part of a page under `## title`, or add it at the end."""
+    parts = page.read_text(encoding="utf-8").rstrip("\n").split("\n## ")
+    new = f"{title}\n\n{text.strip()}\n"
+    at = [k for k, part in enumerate(parts) if k and part.startswith(f"{title}\n")]
+    parts[at[0] if at else len(parts) :] = [new, *parts[(at[0] + 1 if at else len(parts)) :]]
+    page.write_text("\n\n## ".join(part.strip() for part in parts) + "\n", encoding="utf-8")
 
 
 def say(text: str) -> None:
@@ -72,10 +82,9 @@ def machine() -> str:
     return f"{host}; {', '.join(versions)}."
 
 
-INTRO = """# Benchmarks beside other libraries
-
-Written by `make bench-peers`. Surfaces are developable, so the exact distance is that of their
-unrolling. They are seen on a 2.5 mm grid with noise along the view, independent from pixel to
+TITLE = "Beside other libraries"
+INTRO = """Written by `make bench-peers`. Surfaces are developable, so the exact distance is that of
+their unrolling. They are seen on a 2.5 mm grid with noise along the view, independent from pixel to
 pixel unless said otherwise, and turned in the image. Errors of lines are median / 95th percentile /
 median signed error in per cent, over pairs of 5 to 40 cm. Other libraries get the points after a
 quadratic fit with a Gaussian weight of 7.5 mm ("smooth +"), which they do not bring. Ratios of

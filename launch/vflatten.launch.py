@@ -11,6 +11,8 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+SHOWN = ["rig/points", *(f"vflatten/{name}" for name in ("points", "markers", "contour", "image"))]
+
 
 def generate_launch_description() -> LaunchDescription:
     config = PathJoinSubstitution([FindPackageShare("vflatten_ros"), "config"])
@@ -46,6 +48,9 @@ def generate_launch_description() -> LaunchDescription:
             Node(
                 package="rviz2",
                 executable="rviz2",
+                namespace=LaunchConfiguration("namespace"),
+                # the layout's topics are those of a node without a namespace
+                remappings=[(f"/{topic}", topic) for topic in SHOWN],
                 arguments=["-d", PathJoinSubstitution([config, "vflatten.rviz"])],
                 condition=IfCondition(LaunchConfiguration("rviz")),
             ),

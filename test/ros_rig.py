@@ -234,7 +234,9 @@ class Rig:
             for status in message.status:
                 if status.hardware_id == name:
                     values = {value.key: value.value for value in status.values}
-                    found[status.name.split(": ")[1]] = values | {"": status.message}
+                    of, part = status.name.split(": ")
+                    assert of == name.lstrip("/")  # two rigs share /diagnostics
+                    found[part] = values | {"": status.message}
 
         node = self.planner
         subscription = node.create_subscription(DiagnosticArray, "/diagnostics", keep, 10)

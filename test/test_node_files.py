@@ -36,6 +36,8 @@ def test_the_launch_file_starts_the_installed_node():
     text = (ROOT / "launch" / "vflatten.launch.py").read_text()
     ast.parse(text)
     assert 'executable="vflatten_node"' in text
+    remapped = ast.literal_eval(re.search(r"for name in (\(.+?\))", text)[1])
+    assert set(remapped) == set(SHOWN)  # a namespace moves what RViz shows, too
     assert len(text.splitlines()) < 80  # one page
 
 

@@ -18,6 +18,7 @@ from vflatten_ros.categories import load_templates
 from vflatten_ros.core.calibration import calibration_from
 from vflatten_ros.core.errors import InvalidCloud, InvalidConfig
 from vflatten_ros.core.events import (
+    REMEDIES,
     ClockJumped,
     CloudDropped,
     Event,
@@ -29,7 +30,7 @@ from vflatten_ros.files import load_calibration
 from vflatten_ros.frames import Frames
 from vflatten_ros.goals import Goals, Listener, Task
 from vflatten_ros.node_inputs import Inputs, Throttle
-from vflatten_ros.node_lifecycle import ACTIVE, AnsweringLifecycleNode
+from vflatten_ros.node_lifecycle import ACTIVE, INACTIVE, SUCCESS, AnsweringLifecycleNode
 from vflatten_ros.node_outputs import (
     ERROR,
     OK,
@@ -74,6 +75,7 @@ class FlattenNode(AnsweringLifecycleNode):
         self.goals: Goals | None = None
         self.last_garment: FlatGarment | None = None
         self.frames = Frames(self)
+        self._waits_for_tf = False  # to activate by itself
         self.errors = 0  # of our own, caught by the main loop
         self._finished = self._failed = 0
         self._failing = False
@@ -117,6 +119,30 @@ class FlattenNode(AnsweringLifecycleNode):
             self.session.buffer.configure(settings.core)
 
     # ---- lifecycle
+
+    def autostart(self) -> None:
+        """Configure and activate; a calibration from TF is waited for."""
+        options = self.settings.node.calibration
+        wanted = bool(options.tf_frame) and not options.file
+        if not (wanted and self.frames.open()):
+            super().autostart()
+        elif self.trigger_configure() == SUCCESS:
+            self._waits_for_tf = True
+            self._activate_with_tf()
+
+    def _activate_with_tf(self) -> None:
+        """Activate once TF knows the calibration's frames; others may do it before."""
+        options = self.settings.node.calibration
+        self._waits_for_tf &= self.lifecycle_state()[0] == INACTIVE
+        if not self._waits_for_tf:
+            return
+        if self.frames.known(options.frame, options.tf_frame):
+            self._waits_for_tf = False
+            self.trigger_activate()
+            return
+        frames = f"from {options.tf_frame!r} to {options.frame!r}"
+        self.trouble = f"calibration.tf_frame: waiting for a transform {frames}"
+        self.warn("tf", f"{self.trouble}; is it published, on /tf or /tf_static?")
 
     def configure(self) -> None:
         """Check the categories and start the flattening process."""
@@ -211,7 +237,12 @@ class FlattenNode(AnsweringLifecycleNode):
             text = f"stamps went back by {back:.3f} s: the views of before are forgotten"
             self.warn("clock", text)
         elif isinstance(event, CloudDropped) and event.reason not in ("duplicate_angle", "cleared"):
-            self.warn(event.reason, f"cloud {event.view_id} dropped, {event.reason}: {event.text}")
+            self.warn(event.reason, self._drop_line(event))
+
+    def _drop_line(self, event: CloudDropped) -> str:
+        remedy = f"; {REMEDIES[event.reason]}" if event.reason in REMEDIES else ""
+        topic = self._sensors.topic("clouds")
+        return f"{topic}: cloud {event.view_id} dropped, {event.reason}: {event.text}{remedy}"
 
     def buffer_changed(self) -> None:
         """Publish the buffer's state and have its views at the worker."""
@@ -289,6 +320,7 @@ class FlattenNode(AnsweringLifecycleNode):
                 self.get_logger().warning(line)
 
     def _on_diagnostics(self) -> None:
+        self._activate_with_tf()
         for line in self._sensors.check_quiet(self.settings.node.node.no_data_warning_s):
             self.get_logger().warning(line)
         self._results.publish_diagnostics(self._statuses())

@@ -30,11 +30,12 @@ class Frames:
         self._node = node
         self._buffer: Any = None
 
-    def open(self) -> None:
-        """Begin to listen; done at the first need, so that nobody pays for an unused listener."""
+    def open(self) -> bool:
+        """Begin to listen, at the first need: nobody pays for an unused listener. False: no TF."""
         if self._buffer is None and tf2_ros is not None:
             self._buffer = tf2_ros.Buffer(node=self._node)
             self._listener = tf2_ros.TransformListener(self._buffer, self._node)
+        return self._buffer is not None
 
     def matrix(self, target: str, source: str) -> Float:
         """(4, 4) newest T_target_source. Raises Refused."""
@@ -49,6 +50,10 @@ class Frames:
             ) from error
         q, t = found.rotation, found.translation
         return rigid(_rotation(q.x, q.y, q.z, q.w), np.array([t.x, t.y, t.z]))
+
+    def known(self, target: str, source: str) -> bool:
+        """Whether a transform between the two has come."""
+        return self._buffer is not None and bool(self._buffer.can_transform(target, source, Time()))
 
     def calibration_values(self, options: CalibrationOptions) -> dict[str, Any]:
         """Axis and gripper tip of `calibration.tf_frame` in the rig frame."""

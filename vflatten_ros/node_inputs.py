@@ -102,6 +102,11 @@ class Inputs:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
 
+    def topic(self, name: str) -> str:
+        """Topic of "clouds" or "joint_states"; while not subscribed, that name."""
+        subscription = self._subscriptions.get(name)
+        return str(subscription.topic_name) if subscription is not None else name
+
     def take_joint_states(self) -> None:
         """Take every joint state that has come, now.
 
@@ -187,9 +192,9 @@ class Inputs:
         def note(event: Any) -> None:
             policy = qos_policy_name_from_kind(event.last_policy_kind)
             self.traffic[name].incompatible = policy
-            topic = self._subscriptions[name].topic_name if name in self._subscriptions else name
+            remedy = _qos_remedy(name, policy)
             self._node.get_logger().warning(
-                f"a publisher of {topic} cannot reach this node: {_qos_remedy(name, policy)}"
+                f"a publisher of {self.topic(name)} cannot reach this node: {remedy}"
             )
 
         return note

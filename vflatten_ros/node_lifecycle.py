@@ -12,7 +12,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 
 from vflatten_ros.core.errors import VFlattenError
 
-ACTIVE = 3  # lifecycle_msgs/State.PRIMARY_STATE_ACTIVE
+INACTIVE, ACTIVE = 2, 3  # lifecycle_msgs/State.PRIMARY_STATE_...
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 

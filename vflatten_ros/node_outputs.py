@@ -61,7 +61,7 @@ class Outputs:
 
     def publish_diagnostics(self, statuses: list[Status]) -> None:
         """Publish one status for every part of the node."""
-        name = self._node.get_name()
+        name = self._hardware_id.lstrip("/")  # two rigs may share the topic
         rows = [
             (level, f"{name}: {part}", text, self._hardware_id, values)
             for level, part, text, values in statuses

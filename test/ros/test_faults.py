@@ -72,7 +72,9 @@ def test_a_cloud_of_another_frame_and_absurd_joint_states_are_counted(rig):
     rig.publish(lost)
     rig.until(lambda: rig.buffer().clouds_received == 1, "the cloud")
     assert rig.drops() == {"wrong_frame": 1}
-    assert "frame 'map', the calibration is for 'rig_optical'" in rig.node.log()
+    (line,) = [line for line in rig.node.log().splitlines() if "wrong_frame" in line]
+    assert f"{rig.namespace}/rig/points: cloud 0 dropped" in line
+    assert "frame 'map', the calibration is for 'rig_optical'; correct the frame" in line
     rig.serves_a_good_rotation()
 
 

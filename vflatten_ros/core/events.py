@@ -22,6 +22,18 @@ DROP_REASONS: Mapping[str, str] = {
     "cleared": "removed on request",
 }
 
+REMEDIES: Mapping[str, str] = {
+    "no_joint_state": "check the joint in the calibration and the topic of the joint states",
+    "too_old": "send joint states faster, or synchronise the clocks of camera and robot",
+    "time_went_backwards": "let one publisher only send clouds, with a clock that does not jump",
+    "empty_after_segmentation": "check the calibration and segmentation.*",
+    "wrist_moving_too_fast": "turn slower, or raise buffer.max_rate_rad_s",
+    "item_swinging": "wait longer after picking up",
+    "buffer_full": "raise buffer.max_views, max_megabytes or max_waiting",
+    "wrong_frame": "correct the frame in the calibration or in the camera driver",
+    "invalid_cloud": "correct the camera driver",
+}
+
 
 @dataclass(frozen=True)
 class ViewAdded:

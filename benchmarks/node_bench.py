@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
@@ -72,9 +73,10 @@ class Bench(Node):
         self._player.play(self._messages[last + 1 :], 1e6)
         return at
 
-    def result_after_rotation(self, rate: float) -> dict[str, Any]:
+    def result_after_rotation(self, rate: float, pid: int) -> dict[str, Any]:
         """Latency of state calls while flattening; time from the last cloud to the result."""
         published = self.turn(rate)
+        used = cpu_s(pid)
         while self.state().buffer.state != COMPLETE:
             if time.monotonic() - published > 20.0:
                 raise TimeoutError("the rotation does not become complete")
@@ -100,6 +102,7 @@ class Bench(Node):
         return {
             "last_cloud_to_result_s": total,
             "gathered_s": gathered - published,
+            "cpu_s": [after - before for after, before in zip(cpu_s(pid), used, strict=True)],
             "stages_s": stages,
             "state_ms": [1e3 * value for value in latencies],
         }
@@ -129,11 +132,25 @@ class Bench(Node):
         return {"clouds_node_mb_worker_mb": series}
 
 
+def workers(pid: int) -> list[str]:
+    """The node's flattening process."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+
+
+def cpu_s(pid: int) -> tuple[float, float]:
+    """CPU seconds so far of the node and of its flattening process."""
+    return _cpu_s(str(pid)), sum(map(_cpu_s, workers(pid)))
+
+
+def _cpu_s(pid: str) -> float:
+    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
 def resident(pid: int) -> tuple[float, float]:
     """MB of the node and of its flattening process."""
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    workers = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
-    return _resident(str(pid)), sum(map(_resident, workers))
+    return _resident(str(pid)), sum(map(_resident, workers(pid)))
 
 
 def _resident(pid: str) -> float:
@@ -155,12 +172,16 @@ def report(results: list[dict[str, Any]], cancels: list[float]) -> dict[str, Any
     shares["asking and answering"] = total - sum(shares.values())
     for stage, seconds in shares.items():
         print(f"  {stage:22s} {seconds:6.3f} s {seconds / total:6.1%}")
+    node, worker = middle["cpu_s"]
+    print(f"CPU meanwhile: node {node:.2f} s, flattening process {worker:.2f} s; "
+          f"load average {os.getloadavg()[0]:.1f}")  # fmt: skip
     print(f"cancel to answer: longest {1e3 * max(cancels):.0f} ms of {len(cancels)}")
     return {
         "state_p50_ms": p50,
         "state_p99_ms": p99,
         "last_cloud_to_result_s": float(np.median(totals)),
         "stages_s": shares,
+        "cpu_s": {"node": node, "flattening process": worker},
         "cancel_ms": 1e3 * max(cancels),
     }
 
@@ -196,7 +217,8 @@ def main() -> int:
     transport.use_profile()
     command = [sys.executable, "-m", "vflatten_ros.node"]
     command += ["--calibration", str(args.recording / "calibration.yaml")]
-    command += ["--ros-args", "-p", "auto_flatten:=false", "--log-level", "warn"]
+    command += ["--ros-args", "-p", "auto_flatten:=false"]
+    command += ["-p", "no_data_warning_s:=600.0", "--log-level", "warn"]
     node = subprocess.Popen(command)
     rclpy.init()
     bench = Bench(args.recording, args.method)
@@ -204,7 +226,7 @@ def main() -> int:
         bench.connect()
         results, cancels = [], []
         for _ in range(args.rounds):
-            results.append(bench.result_after_rotation(args.rate))
+            results.append(bench.result_after_rotation(args.rate, node.pid))
             cancels.append(bench.cancel_latency())
         figures = report(results, cancels)
         if args.clouds:

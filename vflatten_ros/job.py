@@ -4,26 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from importlib import import_module
-from typing import Any
 
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import FlatGarment, Progress, View
-from vflatten_ros.messages import fill
-from vflatten_ros.outputs import result_messages
+from vflatten_ros.messages import fill, message_class
+from vflatten_ros.outputs import TYPES, result_messages
 from vflatten_ros.worker import Job, Work
 
 
 def prepare(categories: str) -> Work:
     """Load the categories of a folder ("": those of the package)."""
-    # now, so that the first job need not wait for them
-    import rclpy.serialization  # noqa: F401
-    from visualization_msgs.msg import MarkerArray
+    # now, so that the first job need not wait for it
+    from rclpy.serialization import serialize_message
 
     import vflatten_ros.core.pipeline  # noqa: F401
 
-    MarkerArray()
+    for name in TYPES.values():
+        serialize_message(message_class(name)())
 
     return partial(flatten, load_templates(categories or None))
 
@@ -45,13 +43,7 @@ def serialized(garment: FlatGarment, views: Sequence[View]) -> dict[str, bytes]:
 
     return {
         message.topic.rpartition("/")[2]: bytes(
-            serialize_message(fill(_class_of(message.type)(), message.fields))
+            serialize_message(fill(message_class(message.type)(), message.fields))
         )
         for message in result_messages(garment, views)
     }
-
-
-def _class_of(name: str) -> Any:
-    """The class of "package/Message"."""
-    package, message = name.split("/")
-    return getattr(import_module(f"{package}.msg"), message)

@@ -316,12 +316,14 @@ def _rms(values: Float) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
-# rclpy messages: only the three functions below touch them, through their own description
+# rclpy messages: only the functions below touch them, through their own description
 
 _TYPECODES = {
     "float": "f", "double": "d", "octet": "B", "uint8": "B", "int8": "b", "uint16": "H",
     "int16": "h", "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q",
 }  # fmt: skip
+_field_types: dict[type, Mapping[str, str]] = {}  # of the classes filled so far
+_AS_IT_IS = {*_TYPECODES, "boolean", "string"} - {"octet"}
 _SEQUENCE = re.compile(r"sequence<(?P<of>[^,>]+)(, \d+)?>|(?P<fixed>[^\[]+)\[(?P<size>\d+)\]")
 
 
@@ -333,9 +335,12 @@ def fill(message: Any, fields: Mapping[str, Any]) -> Any:
     KeyError
         A field that the message does not have.
     """
-    types = message.get_fields_and_field_types()
+    types = _field_types.get(type(message))
+    if types is None:  # asked once: every answer is a copy
+        types = _field_types[type(message)] = message.get_fields_and_field_types()
     for name, value in fields.items():
-        setattr(message, name, _as_field(types[name], value))
+        kind = types[name]
+        setattr(message, name, value if kind in _AS_IT_IS else _as_field(kind, value))
     return message
 
 
@@ -343,11 +348,11 @@ def _as_field(kind: str, value: Any) -> Any:
     many = _SEQUENCE.fullmatch(kind)
     if many is None:
         if "/" in kind:
-            return fill(_message_class(kind)(), value)
+            return fill(message_class(kind)(), value)
         return bytes([value]) if kind == "octet" else value
     of = many["of"] or many["fixed"]
     if "/" in of:
-        create = _message_class(of)
+        create = message_class(of)
         return [fill(create(), item) for item in value]
     if many["fixed"]:
         return (
@@ -360,7 +365,8 @@ def _as_field(kind: str, value: Any) -> Any:
     return list(value)
 
 
-def _message_class(kind: str) -> Any:
+def message_class(kind: str) -> Any:
+    """The class of a message, by "package/Name" or "package/msg/Name"."""
     package, name = kind.split("/")[0], kind.split("/")[-1]
     return getattr(import_module(f"{package}.msg"), name)
 

@@ -6,16 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PolygonStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import Image, PointCloud2
-from visualization_msgs.msg import MarkerArray
 
 from vflatten_ros import displays, messages
 from vflatten_ros.goals import Goals
-from vflatten_ros.msg import FlattenedView, GarmentEstimate, ViewBufferState
+from vflatten_ros.messages import message_class
+from vflatten_ros.msg import ViewBufferState
+from vflatten_ros.outputs import TYPES
 from vflatten_ros.parameters import OutputOptions
 from vflatten_ros.session import Session
 
@@ -24,14 +23,7 @@ LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-RESULTS = {
-    "flattened_view": FlattenedView,
-    "garment": GarmentEstimate,
-    "contour": PolygonStamped,
-    "markers": MarkerArray,
-    "image": Image,
-    "points": PointCloud2,
-}
+RESULTS = {name: message_class(kind) for name, kind in TYPES.items()}
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 Status = tuple[int, str, str, Mapping[str, Any]]  # level, part, message, values
 

@@ -10,6 +10,15 @@ from vflatten_ros.core.values import FlatGarment, View
 from vflatten_ros.messages import Fields
 from vflatten_ros.picture import draw_flat
 
+TYPES = {  # of the topics below the node's name
+    "flattened_view": "vflatten_ros/FlattenedView",
+    "garment": "vflatten_ros/GarmentEstimate",
+    "contour": "geometry_msgs/PolygonStamped",
+    "markers": "visualization_msgs/MarkerArray",
+    "points": "sensor_msgs/PointCloud2",
+    "image": "sensor_msgs/Image",
+}
+
 
 class Message(NamedTuple):
     """One message to write."""
@@ -22,24 +31,15 @@ class Message(NamedTuple):
 
 def result_messages(garment: FlatGarment, views: Sequence[View]) -> list[Message]:
     """What the node would publish, on the node's topics."""
-    fields: dict[str, tuple[str, Fields]] = {
-        "flattened_view": (
-            "vflatten_ros/FlattenedView",
-            messages.flattened_view_fields(garment, views),
-        ),
-        "garment": (
-            "vflatten_ros/GarmentEstimate",
-            messages.garment_estimate_fields(garment, views),
-        ),
-        "contour": ("geometry_msgs/PolygonStamped", displays.contour_fields(garment)),
-        "markers": ("visualization_msgs/MarkerArray", displays.marker_fields(garment, views)),
-        "points": ("sensor_msgs/PointCloud2", displays.points_fields(garment, views)),
-        "image": (
-            "sensor_msgs/Image",
-            displays.image_fields(draw_flat(garment), garment.stamp_ns),
-        ),
+    fields: dict[str, Fields] = {
+        "flattened_view": messages.flattened_view_fields(garment, views),
+        "garment": messages.garment_estimate_fields(garment, views),
+        "contour": displays.contour_fields(garment),
+        "markers": displays.marker_fields(garment, views),
+        "points": displays.points_fields(garment, views),
+        "image": displays.image_fields(draw_flat(garment), garment.stamp_ns),
     }
     return [
-        Message(f"/vflatten/{name}", kind, garment.stamp_ns, values)
-        for name, (kind, values) in fields.items()
+        Message(f"/vflatten/{name}", kind, garment.stamp_ns, fields[name])
+        for name, kind in TYPES.items()
     ]

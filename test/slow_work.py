@@ -13,18 +13,33 @@ import garments
 GOOD, SLOW, STUBBORN, CRASH, WRONG, MISTAKE = 30, 31, 32, 33, 34, 35
 
 
-def prepare():
-    return work
+def load():
+    return SlowWork()
 
 
-def prepare_and_fail():
+def load_and_fail():
     raise ValueError("cannot even start")
 
 
-def work(views, job, progress):
+class SlowWork:
+    """Counts the views that were prepared before a job asked for them."""
+
+    def __init__(self):
+        self.prepared = []
+
+    def prepare(self, view, config):
+        self.prepared.append(view.view_id)
+        if config.geodesics.nodes == WRONG:
+            raise ValueError("a view that cannot be prepared")
+
+    def flatten(self, views, job, progress):
+        garment = example_or_trouble(job.config.geodesics.nodes, progress)
+        return garment, {"garment": b"bytes", "prepared": bytes(self.prepared)}
+
+
+def example_or_trouble(what, progress):
     from vflatten_ros.core.errors import NotEnoughViews
 
-    what = job.config.geodesics.nodes
     progress("work", 0.0)
     if what == STUBBORN:
         time.sleep(30.0)  # without a word
@@ -37,4 +52,4 @@ def work(views, job, progress):
     for step in range(100 if what == SLOW else 2):
         progress("work", step / 100)
         time.sleep(0.02)
-    return garments.example_garment(), {"garment": b"bytes"}
+    return garments.example_garment()

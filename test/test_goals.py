@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import signal
 import threading
@@ -32,16 +33,16 @@ class Asker:
 class Office:
     """A queue with its worker, and a loop as the node's."""
 
-    def __init__(self, prepare=slow_work.prepare, max_waiting=2):
+    def __init__(self, load=slow_work.load, max_waiting=2):
         self.woken = threading.Event()
-        self.worker = Worker(prepare, self.woken.set)
+        self.worker = Worker(load, self.woken.set)
         self.goals = Goals(self.worker, lambda: max_waiting)
         self.log = []
 
     def ask(self, what, views=VIEWS):
         asker = Asker()
-        self.goals.keep(views)
         config = dataclasses.replace(Config(), geodesics=GeodesicConfig(nodes=what))
+        self.goals.keep(views, config)
         asker.accepted = self.goals.submit(Task(tuple(views), (), config), asker.listener)
         return asker
 
@@ -71,14 +72,14 @@ def office(shared_office):
     yield shared_office
     shared_office.goals.cancel_all("the test is over")
     shared_office.until(lambda: not shared_office.goals.busy)
-    shared_office.goals.keep(())  # forgets the last outcome
+    shared_office.goals.keep((), Config())  # forgets the last outcome
 
 
 def test_a_task_ends_with_a_garment_feedback_and_times(office):
     asker = office.ask(slow_work.GOOD)
     outcome = office.answer(asker)
     assert outcome.garment.category == "towel"
-    assert outcome.messages == {"garment": b"bytes"}
+    assert outcome.messages["garment"] == b"bytes"
     assert outcome.seconds["work"] >= 0.03
     assert "work" in [stage for stage, _ in asker.steps]
 
@@ -98,13 +99,23 @@ def test_the_process_gets_every_view_once(office):
     spy = office.worker._outbox = Spy(office.worker._outbox)
     try:
         office.answer(office.ask(slow_work.GOOD))
-        office.goals.keep(VIEWS)
-        office.goals.keep(VIEWS[:1])
+        office.goals.keep(VIEWS, Config())
+        office.goals.keep(VIEWS[:1], Config())
     finally:
         office.worker._outbox = spy.outbox
     kinds = [message[0] for message in spy.sent]
     assert kinds.count("view") == len(VIEWS)
     assert kinds.count("forget") == 1
+
+
+def test_views_are_prepared_as_they_come_before_a_task_asks(office):
+    """One that cannot be is left to the task that needs it."""
+    wrong = dataclasses.replace(Config(), geodesics=GeodesicConfig(nodes=slow_work.WRONG))
+    office.goals.keep(VIEWS, wrong)
+    ids = bytes(view.view_id for view in VIEWS)
+    tasks = itertools.count(100)  # each another one, so that it is worked on
+    office.until(lambda: office.answer(office.ask(next(tasks))).messages["prepared"][-2:] == ids)
+    assert office.answer(office.ask(slow_work.WRONG)).error == "three views are needed"
 
 
 def test_equal_tasks_are_done_once_and_answered_alike(office):
@@ -174,7 +185,7 @@ def test_a_process_that_dies_costs_one_task(office, how):
 
 
 def test_a_process_that_cannot_start_answers_and_is_not_started_at_once_again():
-    office = Office(slow_work.prepare_and_fail)
+    office = Office(slow_work.load_and_fail)
     try:
         assert "while it started" in office.answer(office.ask(slow_work.GOOD)).error
         assert office.goals.restarts == 0

@@ -43,7 +43,7 @@ from vflatten_ros.node_outputs import (
 from vflatten_ros.node_services import Services, summary
 from vflatten_ros.parameters import CalibrationOptions, Parameters, Settings
 from vflatten_ros.session import NOT_ACTIVE, Refused, Session
-from vflatten_ros.worker import Outcome, Prepare, Worker
+from vflatten_ros.worker import Load, Outcome, Worker
 
 TICK_S = 0.05
 DIAGNOSTICS_S = 1.0
@@ -52,17 +52,15 @@ DIAGNOSTICS_S = 1.0
 class FlattenNode(AnsweringLifecycleNode):
     """Everything runs in one thread, the executor's; flattening runs in another process."""
 
-    def __init__(
-        self, name: str = "vflatten", prepare: Callable[[str], Prepare] | None = None
-    ) -> None:
+    def __init__(self, name: str = "vflatten", loader: Callable[[str], Load] | None = None) -> None:
         """Create the node, unconfigured.
 
         Parameters
         ----------
         name : str
             Node name, unless remapped.
-        prepare : callable, optional
-            Folder of the categories -> what the worker runs; for tests.
+        loader : callable, optional
+            Folder of the categories -> what the flattening process loads; for tests.
 
         Raises
         ------
@@ -70,7 +68,7 @@ class FlattenNode(AnsweringLifecycleNode):
             A parameter that was given has the wrong type or is out of range.
         """
         super().__init__(name)
-        self._prepare = prepare or _prepare_job
+        self._loader = loader or _loader
         self.session: Session | None = None
         self.goals: Goals | None = None
         self.last_garment: FlatGarment | None = None
@@ -149,7 +147,7 @@ class FlattenNode(AnsweringLifecycleNode):
         options = self.settings.node.node
         load_templates(options.categories or None)
         worker = Worker(
-            self._prepare(options.categories), self._worker_guard.trigger, options.worker_nice
+            self._loader(options.categories), self._worker_guard.trigger, options.worker_nice
         )
         self.goals = Goals(worker, lambda: self.settings.node.node.max_queued_goals)
 
@@ -249,7 +247,7 @@ class FlattenNode(AnsweringLifecycleNode):
         if self.session is not None:
             self._results.publish_buffer(buffer_message(self.session))
             if self.goals is not None:
-                self.goals.keep(self.session.buffer.views())
+                self.goals.keep(self.session.buffer.views(), self.settings.core)
 
     def _on_clock_jump(self, jump: Any) -> None:
         """ROS time went back: views from the future cannot be followed by others."""
@@ -346,7 +344,7 @@ class FlattenNode(AnsweringLifecycleNode):
         super().destroy_node()
 
 
-def _prepare_job(categories: str) -> Prepare:
+def _loader(categories: str) -> Load:
     from vflatten_ros import job
 
-    return partial(job.prepare, categories)
+    return partial(job.load, categories)

@@ -140,12 +140,13 @@ class Goals:
             for listener in listeners:
                 listener.on_done(Outcome(run.number, error=reason, cancelled=True))
 
-    def keep(self, views: Sequence[View]) -> None:
+    def keep(self, views: Sequence[View], config: Config) -> None:
         """Have these views ready at the worker, beside those of the tasks."""
         if self._last is not None and not set(self._last[0].views) <= set(views):
             self._last = None
         runs = [run for run in [self._now, *self._waiting] if run is not None]
-        self._worker.keep(list(dict.fromkeys([*views, *(v for r in runs for v in r.task.views)])))
+        kept = dict.fromkeys([*views, *(view for run in runs for view in run.task.views)])
+        self._worker.keep(list(kept), config)
 
     def handle_events(self) -> list[str]:
         """Take what the worker has reported; gives lines for the log."""

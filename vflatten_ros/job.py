@@ -1,20 +1,25 @@
-"""What the flattening process does with a job: the method, then the messages of its result."""
+"""What the flattening process does with views and jobs: the method, then the result's messages."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 from vflatten_ros.categories import load_templates
+from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import FlatGarment, Progress, View
 from vflatten_ros.messages import fill, message_class
 from vflatten_ros.outputs import TYPES, result_messages
-from vflatten_ros.worker import Job, Work
+from vflatten_ros.worker import Job
+
+if TYPE_CHECKING:
+    from vflatten_ros.core.registration import ViewSurface
 
 
-def prepare(categories: str) -> Work:
-    """Load the categories of a folder ("": those of the package)."""
+def load(categories: str) -> Flattening:
+    """Ready for work with the categories of a folder ("": those of the package)."""
     # now, so that the first job need not wait for it
     from rclpy.serialization import serialize_message
 
@@ -23,18 +28,49 @@ def prepare(categories: str) -> Work:
     for name in TYPES.values():
         serialize_message(message_class(name)())
 
-    return partial(flatten, load_templates(categories or None))
+    return Flattening(load_templates(categories or None))
 
 
-def flatten(
-    templates: Sequence[Template], views: Sequence[View], job: Job, progress: Progress
-) -> tuple[FlatGarment, Mapping[str, bytes]]:
-    """Flatten, and serialize the messages of the outputs by the last part of their topic."""
-    from vflatten_ros.core.pipeline import flatten_garment  # not needed by the node's own process
+class Flattening:
+    """The method, with views prepared as they arrive; the numbers are the same without."""
 
-    garment = flatten_garment(views, job.correspondences, templates, job.config, progress)
-    progress("messages", 0.0)
-    return garment, serialized(garment, views)
+    def __init__(self, templates: Sequence[Template]) -> None:
+        self._templates = templates
+        # goes with its view
+        self._prepared: WeakKeyDictionary[View, tuple[RotationConfig, ViewSurface | None]] = (
+            WeakKeyDictionary()
+        )
+
+    def prepare(self, view: View, config: Config) -> None:
+        """What flattening needs of a view whatever the others are."""
+        self._of(view, config)
+
+    def flatten(
+        self, views: Sequence[View], job: Job, progress: Progress
+    ) -> tuple[FlatGarment, Mapping[str, bytes]]:
+        """Flatten, and serialize the messages of the outputs by the last part of their topic."""
+        from vflatten_ros.core.pipeline import flatten_garment  # not needed by the node's process
+
+        prepared = {}
+        for number, view in enumerate(views):
+            progress("surface", number / len(views))
+            surface = self._of(view, job.config)
+            if surface is not None:
+                prepared[view.view_id] = surface
+        garment = flatten_garment(
+            views, job.correspondences, self._templates, job.config, progress, prepared
+        )
+        progress("messages", 0.0)
+        return garment, serialized(garment, views)
+
+    def _of(self, view: View, config: Config) -> ViewSurface | None:
+        from vflatten_ros.core.pipeline import prepare_view
+
+        settings, surface = self._prepared.get(view, (None, None))
+        if settings != config.rotation or surface is None:
+            surface = prepare_view(view, config)
+            self._prepared[view] = (config.rotation, surface)
+        return surface
 
 
 def serialized(garment: FlatGarment, views: Sequence[View]) -> dict[str, bytes]:

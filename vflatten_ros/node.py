@@ -19,7 +19,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from vflatten_ros import transport
 from vflatten_ros.core.errors import VFlattenError
 from vflatten_ros.flatten_node import FlattenNode
-from vflatten_ros.worker import Prepare
+from vflatten_ros.worker import Load
 
 MAX_ERRORS = 1000  # in a row
 
@@ -45,14 +45,14 @@ def spin(node: FlattenNode) -> None:
                 raise
 
 
-def main(argv: Sequence[str] | None = None, prepare: Callable[[str], Prepare] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, loader: Callable[[str], Load] | None = None) -> int:
     """Run the node.
 
     Parameters
     ----------
     argv : sequence of str, optional
         Options, and ROS arguments after `--ros-args`; by default those of the command line.
-    prepare : callable, optional
+    loader : callable, optional
         What flattens instead of the method; for tests.
 
     Returns
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None, prepare: Callable[[str], Prepare] | 
     transport.use_profile()
     rclpy.init(args=[sys.argv[0], *_ros_arguments(sys.argv[1:] if argv is None else argv)])
     try:
-        node = FlattenNode(prepare=prepare)
+        node = FlattenNode(loader=loader)
     except VFlattenError as error:
         print(f"vflatten node: {error}", file=sys.stderr)
         rclpy.try_shutdown()

@@ -1,11 +1,14 @@
 """The process that flattens, so that the node's callbacks never wait for the method.
 
-Views are sent as they arrive; a job names those it wants by key. A process, not a thread: the
-method holds Python's interpreter lock in bursts, and a process can be ended when it does not stop.
+Views are sent as they arrive, and prepared while the process has no job; a job names those it wants
+by key. A process, not a thread: the method holds Python's interpreter lock in bursts, and a process
+can be ended when it does not stop.
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import queue
 import signal
@@ -14,9 +17,10 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, Protocol
 
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import Cancelled, VFlattenError
@@ -69,8 +73,21 @@ class Died:
 
 
 Event = Step | Outcome | Ready | Died
-Work = Callable[[Sequence[View], Job, Progress], tuple[FlatGarment, Mapping[str, bytes]]]
-Prepare = Callable[[], Work]
+
+
+class Work(Protocol):
+    """What the process can do."""
+
+    def prepare(self, view: View, config: Config) -> None:
+        """What can be done of a view before a job asks for it."""
+
+    def flatten(
+        self, views: Sequence[View], job: Job, progress: Progress
+    ) -> tuple[FlatGarment, Mapping[str, bytes]]:
+        """A garment, and its serialized messages by topic."""
+
+
+Load = Callable[[], Work]
 
 
 class Worker:
@@ -78,19 +95,20 @@ class Worker:
 
     Parameters
     ----------
-    prepare : callable
-        Called once in the process; gives the function that does a job. Must be importable.
+    load : callable
+        Called once in the process; gives what does the work. Must be importable.
     notify : callable
         Called when `events` has something.
     nice : int
         Added to the process's nice value.
     """
 
-    def __init__(self, prepare: Prepare, notify: Callable[[], None], nice: int = 0) -> None:
-        self._prepare, self._notify, self._nice = prepare, notify, nice
+    def __init__(self, load: Load, notify: Callable[[], None], nice: int = 0) -> None:
+        self._load, self._notify, self._nice = load, notify, nice
         self._events: queue.SimpleQueue[tuple[int, Event]] = queue.SimpleQueue()
         self._keys: dict[View, int] = {}
         self._next_key = 0
+        self._config = Config()
         self._generation = 0
         self._start()
 
@@ -99,16 +117,23 @@ class Worker:
         """Process id."""
         return self._process.pid
 
-    def keep(self, views: Sequence[View]) -> None:
-        """Send the views that the process does not have, and let it forget all others."""
+    def keep(self, views: Sequence[View], config: Config) -> None:
+        """Send the views that the process does not have, and let it forget all others.
+
+        It prepares them with these settings; a job with others can use them, too, only later.
+        """
+        self._config = config
         wanted = set(views)
         for view in [view for view in self._keys if view not in wanted]:
             self._outbox.put(("forget", self._keys.pop(view)))
         for view in views:
             if view not in self._keys:
                 self._keys[view] = self._next_key
-                self._outbox.put(("view", self._next_key, view))
                 self._next_key += 1
+                self._send(view)
+
+    def _send(self, view: View) -> None:
+        self._outbox.put(("view", self._keys[view], view, self._config))
 
     def submit(
         self, number: int, views: Sequence[View], pairs: Sequence[Correspondence], config: Config
@@ -132,8 +157,8 @@ class Worker:
         """End the process as it is and begin a new one, which gets the kept views again."""
         self.stop()
         self._start()
-        for view, key in self._keys.items():
-            self._outbox.put(("view", key, view))
+        for view in self._keys:
+            self._send(view)
 
     def stop(self) -> None:
         """End the process."""
@@ -146,7 +171,7 @@ class Worker:
         context = get_context("spawn")
         ours, theirs = context.Pipe()
         self._process = context.Process(
-            target=serve, args=(theirs, self._prepare, self._nice), daemon=True, name="flatten"
+            target=serve, args=(theirs, self._load, self._nice), daemon=True, name="flatten"
         )
         self._process.start()
         theirs.close()
@@ -178,28 +203,36 @@ class Worker:
                 return
 
 
-def serve(pipe: Connection, prepare: Prepare, nice: int) -> None:
+def serve(pipe: Connection, load: Load, nice: int) -> None:
     """What the process runs: take jobs until the other end is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the group; the node decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.nice(nice)
     inbox = _Inbox(pipe)
     threading.Thread(target=inbox.receive, daemon=True).start()
-    work = prepare()
+    work = load()
     pipe.send(Ready())
     while True:
-        job, views = inbox.jobs.get()
-        pipe.send(_outcome(work, job, views, _Reporter(pipe, job, inbox)))
+        inbox.next_task()(work)
+
+
+_Task = Callable[[Work], None]
+_JOB, _PREPARE = 0, 1  # priorities
 
 
 class _Inbox:
     """Messages of the node, taken by a thread so that a cancel is seen during a job."""
 
     def __init__(self, pipe: Connection) -> None:
-        self.jobs: queue.SimpleQueue[tuple[Job, list[View]]] = queue.SimpleQueue()
         self.cancelled: set[int] = set()
         self._pipe = pipe
         self._views: dict[int, View] = {}
+        self._tasks: queue.PriorityQueue[tuple[int, int, _Task]] = queue.PriorityQueue()
+        self._numbers = itertools.count()
+
+    def next_task(self) -> _Task:
+        """Wait for something to do: jobs first, then views to prepare."""
+        return self._tasks.get()[2]
 
     def receive(self) -> None:
         try:
@@ -214,13 +247,27 @@ class _Inbox:
         while True:
             kind, *rest = self._pipe.recv()
             if kind == "view":
-                self._views[rest[0]] = rest[1]
+                key, self._views[key], config = rest
+                self._put(_PREPARE, partial(self._prepare, key, config))
             elif kind == "forget":
                 self._views.pop(rest[0], None)
             elif kind == "cancel":
                 self.cancelled.add(rest[0])
             else:
-                self.jobs.put((rest[0], [self._views[key] for key in rest[0].view_keys]))
+                views = [self._views[key] for key in rest[0].view_keys]
+                self._put(_JOB, partial(self._do, rest[0], views))
+
+    def _put(self, priority: int, task: _Task) -> None:
+        self._tasks.put((priority, next(self._numbers), task))
+
+    def _prepare(self, key: int, config: Config, work: Work) -> None:
+        view = self._views.get(key)
+        if view is not None:
+            with contextlib.suppress(Exception):  # the job that needs the view will say it
+                work.prepare(view, config)
+
+    def _do(self, job: Job, views: list[View], work: Work) -> None:
+        self._pipe.send(_outcome(work, job, views, _Reporter(self._pipe, job, self)))
 
 
 class _Reporter:
@@ -251,7 +298,7 @@ class _Reporter:
 def _outcome(work: Work, job: Job, views: list[View], report: _Reporter) -> Outcome:
     try:
         report("start", 0.0)
-        garment, messages = work(views, job, report)
+        garment, messages = work.flatten(views, job, report)
         report.close(time.perf_counter())
         return Outcome(job.number, garment, messages, report.seconds)
     except Cancelled as error:

@@ -51,7 +51,7 @@ def node(ros, monkeypatch):
             TransformException=LookupError,
         ),
     )
-    node = FlattenNode("with_tf", prepare=lambda folder: slow_work.prepare)
+    node = FlattenNode("with_tf", loader=lambda folder: slow_work.load)
     values = {"frame": "rig_optical", "joint": "wrist_roll", "tf_frame": "tool0"}
     node.set_parameters([Parameter(f"calibration.{k}", value=v) for k, v in values.items()])
     yield node

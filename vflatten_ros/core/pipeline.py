@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.one_view import flatten_one_view
 from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, finish, recognise
+from vflatten_ros.core.registration import ViewSurface, view_surface
 from vflatten_ros.core.rotation import Unfolded, turn_parts, unfold_views, unfold_without_necks
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
@@ -31,12 +32,24 @@ from vflatten_ros.core.values import (
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 
 
+def prepare_view(view: View, config: Config) -> ViewSurface | None:
+    """What flattening needs of a view whatever the others are: do it as the view arrives.
+
+    Raises
+    ------
+    VFlattenError
+        As flatten_garment would of this view.
+    """
+    return view_surface(view, config.rotation) if config.method == "rotation" else None
+
+
 def flatten_garment(
     views: Sequence[View],
     correspondences: Sequence[Correspondence],
     templates: Sequence[Template],
     config: Config,
     progress: Progress = no_progress,
+    prepared: Mapping[int, ViewSurface] | None = None,
 ) -> FlatGarment:
     """Lay a hanging item flat: its outline, category, sizes and named places.
 
@@ -50,6 +63,8 @@ def flatten_garment(
         Categories to choose from.
     config : Config
     progress : Progress
+    prepared : mapping of int to ViewSurface, optional
+        Results of prepare_view by view_id, with the same config.
 
     Raises
     ------
@@ -59,7 +74,7 @@ def flatten_garment(
     if not views:
         raise NotEnoughViews("no views to flatten")
     method = {"kita2019": _kita2019, "rotation": _rotation}[config.method]
-    flattened, settled = method(views, correspondences, templates, config, progress)
+    flattened, settled = method(views, correspondences, templates, config, progress, prepared or {})
     return _described(flattened, settled, views, templates, config, progress)
 
 
@@ -69,6 +84,7 @@ def _kita2019(
     templates: Sequence[Template],
     config: Config,
     progress: Progress,
+    prepared: Mapping[int, ViewSurface],
 ) -> tuple[Flattened, Recognition | None]:
     """The paper's method: two views and a few corresponding points, or one view alone."""
     if len(views) == 1:
@@ -82,9 +98,12 @@ def _rotation(
     templates: Sequence[Template],
     config: Config,
     progress: Progress,
+    prepared: Mapping[int, ViewSurface],
 ) -> tuple[Flattened, Recognition | None]:
     """The automatic method: all views of a rotation."""
-    unfolded, found = _likeliest(views, correspondences, tuple(templates), config, progress)
+    unfolded, found = _likeliest(
+        views, correspondences, tuple(templates), config, progress, prepared
+    )
     for _ in range(TURNS if found.category != UNKNOWN else 0):
         fit = found.fits[found.category]
         rest = place(fit.template, fit.pose, fit.template.at_rest(fit.state))[0]
@@ -109,9 +128,10 @@ def _likeliest(
     templates: tuple[Template, ...],
     config: Config,
     progress: Progress,
+    prepared: Mapping[int, ViewSurface],
 ) -> tuple[Unfolded, Recognition]:
     """The surface as linked, or if that makes a doubtful item, with its false necks cut."""
-    unfolded = unfold_views(views, correspondences, config.rotation, progress)
+    unfolded = unfold_views(views, correspondences, config.rotation, progress, prepared)
     progress("recognition", 0.0)
     found = recognise(unfolded.outline, unfolded.points, templates, config.recognition)
     if _certainty(found) > config.rotation.certain and unfolded.overlap < config.rotation.overlaid:

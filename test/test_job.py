@@ -1,0 +1,70 @@
+"""What the flattening process keeps of views, without running the method."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+from types import SimpleNamespace
+
+import garments
+import pytest
+
+from vflatten_ros import job
+from vflatten_ros.core import pipeline
+from vflatten_ros.core.config import Config, RotationConfig
+
+CONFIG = Config()
+COARSE = dataclasses.replace(CONFIG, rotation=RotationConfig(view_fit_m=0.02))
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """The method replaced by notes of how it was called."""
+    noted = SimpleNamespace(prepared=[], given=None)
+
+    def prepare_view(view, config):
+        noted.prepared.append(view.view_id)
+        return f"surface of {view.view_id}"
+
+    def flatten_garment(views, pairs, templates, config, progress, prepared):
+        noted.given = dict(prepared)
+        return garments.example_garment()
+
+    monkeypatch.setattr(pipeline, "prepare_view", prepare_view)
+    monkeypatch.setattr(pipeline, "flatten_garment", flatten_garment)
+    monkeypatch.setattr(job, "serialized", lambda garment, views: {})
+    return noted
+
+
+def flatten(work, views, config):
+    task = SimpleNamespace(correspondences=(), config=config)
+    work.flatten(views, task, lambda stage, fraction: None)
+
+
+def test_a_view_is_prepared_once_and_given_to_the_method(calls):
+    first, second = garments.example_views()
+    work = job.Flattening(())
+    work.prepare(first, CONFIG)
+    assert calls.prepared == [first.view_id]
+    for _ in range(2):
+        flatten(work, (first, second), CONFIG)
+    assert calls.prepared == [first.view_id, second.view_id]
+    assert calls.given == {v.view_id: f"surface of {v.view_id}" for v in (first, second)}
+
+
+def test_what_was_prepared_with_other_settings_is_not_used(calls):
+    (view, _) = garments.example_views()
+    work = job.Flattening(())
+    work.prepare(view, COARSE)
+    flatten(work, (view,), CONFIG)
+    assert calls.prepared == [view.view_id] * 2
+
+
+def test_what_was_prepared_goes_with_its_view(calls):
+    views = list(garments.example_views())
+    work = job.Flattening(())
+    for view in views:
+        work.prepare(view, CONFIG)
+    del view, views[0]
+    gc.collect()
+    assert len(work._prepared) == 1

@@ -8,6 +8,7 @@ from vflatten_ros import threads
 threads.use_one()  # the flattening process inherits it
 
 import argparse
+import json
 import signal
 import sys
 import traceback
@@ -97,18 +98,23 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _ros_arguments(argv: Sequence[str]) -> list[str]:
-    """Our own options as ROS arguments; everything from --ros-args on stays as it is."""
+    """Our own options as ROS arguments; everything from --ros-args on stays as it is.
+
+    What comes later wins: a parameter given on the command line over one in a file.
+    """
     given = list(argv)
     at = given.index("--ros-args") if "--ros-args" in given else len(given)
     args = parser().parse_args(given[:at])
-    own: list[str] = []
-    if args.params_file:
-        own += ["--params-file", args.params_file]
-    if args.name:
-        own += ["-r", f"__node:={args.name}"]
+    first = ["--params-file", args.params_file] if args.params_file else []
+    last = ["-r", f"__node:={args.name}"] if args.name else []
     if args.calibration:
-        own += ["-p", f"calibration.file:={args.calibration}"]
-    return [*given[at:], *(["--ros-args", *own] if own else [])]
+        # quoted: a name may look like a number
+        last += ["-p", f"calibration.file:={json.dumps(args.calibration)}"]
+    return [*_group(first), *given[at:], *_group(last)]
+
+
+def _group(arguments: list[str]) -> list[str]:
+    return ["--ros-args", *arguments, "--"] if arguments else []
 
 
 if __name__ == "__main__":

@@ -58,6 +58,22 @@ def test_a_selection_is_kept_until_its_views_go(held):
     assert held.selected() == (2,)
 
 
+def test_the_wrist_is_where_the_last_credible_joint_state_has_it(held):
+    joint = held.calibration.joint
+    for position in (0.5, float("nan"), float("inf"), 1e300):
+        held.add_joint(0, (joint, "other"), (position, 1.0), 0)
+    held.add_joint(0, ("other",), (2.0,), 0)
+    assert held.wrist_rad == 0.5
+
+
+def test_pairs_are_bounded(held, monkeypatch):
+    monkeypatch.setattr(session, "MAX_PAIRS", 1)
+    assert held.add_pairs(map(fields_of, PAIRS[:2]))[1] == (
+        0,
+        "there are 1 pairs already; clear some",
+    )
+
+
 def test_a_new_item_has_no_pairs_and_no_selection(held):
     held.add_pairs(map(fields_of, PAIRS))
     held.select([2])

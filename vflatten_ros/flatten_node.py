@@ -29,7 +29,7 @@ from vflatten_ros.core.values import Calibration, FlatGarment
 from vflatten_ros.files import load_calibration
 from vflatten_ros.frames import Frames
 from vflatten_ros.goals import Goals, Listener, Task
-from vflatten_ros.node_inputs import Inputs, Throttle
+from vflatten_ros.node_inputs import Inputs
 from vflatten_ros.node_lifecycle import ACTIVE, INACTIVE, SUCCESS, AnsweringLifecycleNode
 from vflatten_ros.node_outputs import (
     ERROR,
@@ -78,12 +78,11 @@ class FlattenNode(AnsweringLifecycleNode):
         self._finished = self._failed = 0
         self._failing = False
         self._last = ""
-        self._throttle = Throttle()
         self._declared = Parameters(
             self, lambda: self.lifecycle_state()[0] == ACTIVE, self._on_settings
         )
         self._results = Outputs(self)
-        self._sensors = Inputs(self, self._on_cloud, self._on_joints)
+        self._sensors = Inputs(self, self.log, self._on_cloud, self._on_joints)
         self._requests = Services(self)
         self._worker_guard = self.create_guard_condition(self._on_worker)
         # A paused /clock must stop neither time-outs nor diagnostics.
@@ -140,7 +139,8 @@ class FlattenNode(AnsweringLifecycleNode):
             return
         frames = f"from {options.tf_frame!r} to {options.frame!r}"
         self.trouble = f"calibration.tf_frame: waiting for a transform {frames}"
-        self.warn("tf", f"{self.trouble}; is it published, on /tf or /tf_static?")
+        text = f"{self.trouble}; is it published, on /tf or /tf_static?"
+        self.log.warning(text, cause="tf")
 
     def configure(self) -> None:
         """Check the categories and start the flattening process."""
@@ -158,7 +158,7 @@ class FlattenNode(AnsweringLifecycleNode):
         self.last_garment = None
         self._sensors.open(self.settings.node.clouds, self.settings.node.joint_states)
         self.buffer_changed()
-        self.get_logger().info(
+        self.log.info(
             f"active: clouds in {calibration.frame} turned by {calibration.joint}, method "
             f"{self.settings.core.method}"
         )
@@ -204,7 +204,8 @@ class FlattenNode(AnsweringLifecycleNode):
             events = self.session.reject_cloud(str(error), now)
         except Exception as error:
             self.errors += 1
-            self.warn("cloud", f"internal error with a cloud:\n{traceback.format_exc()}")
+            text = f"internal error with a cloud:\n{traceback.format_exc()}"
+            self.log.warning(text, cause="cloud")
             events = self.session.reject_cloud(f"internal error: {error}", now)
         self.take_events(events)
 
@@ -224,18 +225,17 @@ class FlattenNode(AnsweringLifecycleNode):
             self._flatten_by_itself()
 
     def _note(self, event: Event) -> None:
-        log = self.get_logger()
         if isinstance(event, ItemStarted):
             self.last_garment = None
-            log.info(f"item {event.item} begins: {event.cause}")
+            self.log.info(f"item {event.item} begins: {event.cause}")
         elif isinstance(event, RotationComplete):
-            log.info(f"rotation complete: {event.views} views")
+            self.log.info(f"rotation complete: {event.views} views")
         elif isinstance(event, ClockJumped):
             back = (event.from_ns - event.to_ns) * 1e-9
             text = f"stamps went back by {back:.3f} s: the views of before are forgotten"
-            self.warn("clock", text)
+            self.log.warning(text, cause="clock")
         elif isinstance(event, CloudDropped) and event.reason not in ("duplicate_angle", "cleared"):
-            self.warn(event.reason, self._drop_line(event))
+            self.log.warning(self._drop_line(event), cause=event.reason)
 
     def _drop_line(self, event: CloudDropped) -> str:
         remedy = f"; {REMEDIES[event.reason]}" if event.reason in REMEDIES else ""
@@ -250,20 +250,18 @@ class FlattenNode(AnsweringLifecycleNode):
                 self.goals.keep(self.session.buffer.views(), self.settings.core)
 
     def _on_clock_jump(self, jump: Any) -> None:
-        """ROS time went back: views from the future cannot be followed by others."""
+        """ROS time went back: views from the future cannot be followed by others.
+
+        Joint states often show it before; new views are a little ahead of /clock then.
+        """
         if self.session is None:
             return
         now = self.get_clock().now().nanoseconds
         newest = max((view.stamp_ns for view in self.session.buffer.views()), default=0)
-        if newest > now:
-            self.get_logger().warning("ROS time went back: the views of before are forgotten")
+        if newest > now + self.settings.core.buffer.clock_jump_s * 1e9:
+            text = "ROS time went back: the views of before are forgotten"
+            self.log.warning(text, cause="ROS time")
             self.take_events(self.session.new_item("ROS time went back"))
-
-    def warn(self, cause: str, text: str) -> None:
-        """Log a warning, unless one of the same cause was logged a moment ago."""
-        line = self._throttle.line(cause, text)
-        if line is not None:
-            self.get_logger().warning(line)
 
     # ---- flattening
 
@@ -282,13 +280,13 @@ class FlattenNode(AnsweringLifecycleNode):
 
     def _log_failure(self, outcome: Outcome) -> None:
         if outcome.garment is None and not outcome.cancelled:
-            self.warn("flatten", f"flattening by itself failed: {outcome.error}")
+            self.log.warning(f"flattening by itself failed: {outcome.error}", cause="flatten")
 
     def _on_worker(self) -> None:
         if self.goals is None:
             return
         for line in self.goals.handle_events():
-            self.get_logger().error(line)
+            self.log.error(line, cause="process")
         for task, outcome in self.goals.take_finished():
             self._on_outcome(task, outcome)
 
@@ -305,7 +303,7 @@ class FlattenNode(AnsweringLifecycleNode):
             self.last_garment = outcome.garment
         self._results.publish_result(outcome.messages, self.settings.node.outputs)
         total = sum(outcome.seconds.values())
-        self.get_logger().info(f"item {task.item} flattened in {total:.2f} s: {self._last}")
+        self.log.info(f"item {task.item} flattened in {total:.2f} s: {self._last}")
 
     # ---- timers
 
@@ -315,12 +313,11 @@ class FlattenNode(AnsweringLifecycleNode):
             self.take_events(self.session.tick(time.monotonic_ns()))
         if self.goals is not None:
             for line in self.goals.check_deadlines():
-                self.get_logger().warning(line)
+                self.log.warning(line, cause="stubborn")
 
     def _on_diagnostics(self) -> None:
         self._activate_with_tf()
-        for line in self._sensors.check_quiet(self.settings.node.node.no_data_warning_s):
-            self.get_logger().warning(line)
+        self._sensors.check_quiet(self.settings.node.node.no_data_warning_s)
         self._results.publish_diagnostics(self._statuses())
 
     def _statuses(self) -> list[Status]:

@@ -269,13 +269,10 @@ def pixel_on_item(view: View, pixel: tuple[int, int]) -> tuple[int, int]:
             f"pixel (row {pixel[0]}, col {pixel[1]}) lies outside view {view.view_id} "
             f"of {rows} x {cols}; pixels are given as row, col from 0"
         )
-    gap = (
-        np.hypot(*(view.pixel - np.array(pixel)).T.astype(float))
-        if len(view.pixel)
-        else np.empty(0)
-    )
-    if not len(gap) or gap.min() > PIXEL_REACH:
-        nearest = f"{gap.min():.0f} pixels away" if len(gap) else "nowhere"
+    away = view.pixel - np.array(pixel, dtype=view.pixel.dtype)
+    gap = np.einsum("ij,ij->i", away, away)  # squared
+    if not len(gap) or gap.min() > PIXEL_REACH**2:
+        nearest = f"{gap.min() ** 0.5:.0f} pixels away" if len(gap) else "nowhere"
         raise InvalidCorrespondence(
             f"pixel (row {pixel[0]}, col {pixel[1]}) of view {view.view_id} is not on the item, "
             f"which is {nearest}; choose a point of the cloth that both views show"
@@ -301,7 +298,7 @@ def _pixel_of_point(view: View, point: Float) -> tuple[int, int]:
 def _point_at(view: View | None, pixel: tuple[int, int]) -> Float:
     if view is None:
         return np.full(3, np.nan)
-    here = np.flatnonzero((view.pixel == np.array(pixel)).all(axis=1))
+    here = np.flatnonzero((view.pixel[:, 0] == pixel[0]) & (view.pixel[:, 1] == pixel[1]))
     return view.points_rig[here[0]] if len(here) else np.full(3, np.nan)
 
 

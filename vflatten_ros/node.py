@@ -41,7 +41,8 @@ def spin(node: FlattenNode) -> None:
                 break
             node.errors += 1
             in_a_row += 1
-            node.warn("spin", f"internal error, please report it:\n{traceback.format_exc()}")
+            text = f"internal error, please report it:\n{traceback.format_exc()}"
+            node.log.warning(text, cause="spin")
             if in_a_row == MAX_ERRORS:  # nothing works any more: better to be started anew
                 raise
 

@@ -12,30 +12,11 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 from sensor_msgs.msg import JointState, PointCloud2
 
+from vflatten_ros.node_log import Log
 from vflatten_ros.node_outputs import OK, WARN, Status
 from vflatten_ros.parameters import CloudInput, JointInput
 
 MAX_PUBLISHERS = 4
-REPEAT_S = 60.0  # between warnings that say the same
-
-
-class Throttle:
-    """Lets a line through, then holds back lines of the same cause for a while."""
-
-    def __init__(self, period_s: float = REPEAT_S) -> None:
-        self._period_s = period_s
-        self._last: dict[str, float] = {}
-        self._held: dict[str, int] = {}
-
-    def line(self, cause: str, text: str) -> str | None:
-        """The line to log, or None; says how many were held back."""
-        now = time.monotonic()
-        if now - self._last.get(cause, -1e9) < self._period_s:
-            self._held[cause] = self._held.get(cause, 0) + 1
-            return None
-        self._last[cause] = now
-        held = self._held.pop(cause, 0)
-        return f"{text} ({held} more like this since the last line)" if held else text
 
 
 class Numbers:
@@ -71,10 +52,11 @@ class Inputs:
     def __init__(
         self,
         node: Node,
+        log: Log,
         on_cloud: Callable[[PointCloud2], None],
         on_joints: Callable[[JointState], None],
     ) -> None:
-        self._node = node
+        self._node, self._log = node, log
         self._callbacks = {"clouds": on_cloud, "joint_states": on_joints}
         self._subscriptions: dict[str, Any] = {}
         self.traffic = {"clouds": Traffic(), "joint_states": Traffic()}
@@ -123,16 +105,15 @@ class Inputs:
                 callback(*taken)
                 taken = subscription.handle.take_message(JointState, False)
 
-    def check_quiet(self, limit_s: float) -> list[str]:
-        """Warnings for topics on which nothing has come for long; once for each time."""
-        lines: list[str] = []
+    def check_quiet(self, limit_s: float) -> None:
+        """Warn of topics on which nothing has come for long; once for each time."""
         for name, subscription in self._subscriptions.items():
             traffic = self.traffic[name]
             silence = time.monotonic() - traffic.last_s
             if silence > limit_s and not traffic.quiet:
                 traffic.quiet = True
-                lines.append(self._quiet_line(name, subscription.topic_name, silence))
-        return lines
+                line = self._quiet_line(name, subscription.topic_name, silence)
+                self._log.warning(line, cause=f"no {name}")
 
     def statuses(self, limit_s: float) -> list[Status]:
         """Diagnostics of each topic."""
@@ -183,7 +164,7 @@ class Inputs:
             traffic.last_s = time.monotonic()
             if traffic.quiet:
                 traffic.quiet = False
-                self._node.get_logger().info(f"{name.replace('_', ' ')} come again")
+                self._log.info(f"{name.replace('_', ' ')} come again", cause=f"{name} again")
             callback(message)
 
         return take
@@ -193,9 +174,8 @@ class Inputs:
             policy = qos_policy_name_from_kind(event.last_policy_kind)
             self.traffic[name].incompatible = policy
             remedy = _qos_remedy(name, policy)
-            self._node.get_logger().warning(
-                f"a publisher of {self.topic(name)} cannot reach this node: {remedy}"
-            )
+            text = f"a publisher of {self.topic(name)} cannot reach this node: {remedy}"
+            self._log.warning(text, cause=f"QoS of {name}")
 
         return note
 
@@ -204,10 +184,10 @@ class Inputs:
         if missing and name in self._subscriptions:
             self.traffic[name].lost += missing
             topic = self._subscriptions[name].topic_name
-            self._node.get_logger().warning(
+            self._log.warning(
                 f"{self.traffic[name].lost} messages of {topic} lost "
                 f"on the way since the start; raise {name}.depth or see docs/node.md, DDS",
-                throttle_duration_sec=REPEAT_S,
+                cause=f"lost {name}",
             )
 
 

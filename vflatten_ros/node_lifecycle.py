@@ -11,6 +11,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from vflatten_ros.core.errors import VFlattenError
+from vflatten_ros.node_log import Log
 
 INACTIVE, ACTIVE = 2, 3  # lifecycle_msgs/State.PRIMARY_STATE_...
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -25,6 +26,7 @@ class AnsweringLifecycleNode(LifecycleNode):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
+        self.log = Log(self.get_logger())
         self.trouble = ""  # why the last transition failed
         # rclpy lets an invalid request's RCLError out of spin: it would end the node, unanswered.
         change_state = self._service_change_state.callback
@@ -69,11 +71,11 @@ class AnsweringLifecycleNode(LifecycleNode):
             change()
         except VFlattenError as error:
             self.trouble = str(error)
-            self.get_logger().error(f"cannot {name}: {error}")
+            self.log.error(f"cannot {name}: {error}")
             return FAILURE
         except Exception:
             self.trouble = f"internal error in {name}"
-            self.get_logger().error(f"internal error in {name}:\n{traceback.format_exc()}")
+            self.log.error(f"internal error in {name}:\n{traceback.format_exc()}")
             return TransitionCallbackReturn.ERROR
         self.trouble = ""
         return SUCCESS
@@ -86,10 +88,10 @@ class AnsweringLifecycleNode(LifecycleNode):
         try:
             return change(request, response)
         except rclpy_implementation.RCLError:
-            wanted = request.transition.label or f"transition {request.transition.id}"
-            self.get_logger().warning(
-                f"refused: {wanted} is not possible while {self.lifecycle_state()[1]}"
-            )
+            number, state = request.transition.id, self.lifecycle_state()[1]
+            wanted = request.transition.label[:60] or f"transition {number}"
+            text = f"refused: {wanted} is not possible while {state}"
+            self.log.warning(text, cause=f"transition {number} while {state}")
             response.success = False
             return response
 

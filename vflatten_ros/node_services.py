@@ -26,6 +26,7 @@ from vflatten_ros.session import (
     CANCELLED,
     FAILED,
     INVALID_ARGUMENT,
+    MAX_PAIRS,
     NO_RESULT,
     NOT_SEEN,
     OK,
@@ -155,6 +156,9 @@ class Services:
         session = self._session()
         if not request.pairs:
             raise Refused(INVALID_ARGUMENT, "the request holds no pairs")
+        if len(request.pairs) > MAX_PAIRS:
+            text = f"{len(request.pairs)} pairs in one request; at most {MAX_PAIRS} are taken"
+            raise Refused(INVALID_ARGUMENT, text)
         answers = session.add_pairs(messages.read(pair) for pair in request.pairs)
         response.ids = [number for number, _ in answers]
         response.accepted = [number > 0 for number, _ in answers]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -11,13 +12,14 @@ from vflatten_ros.core.buffer import ViewBuffer
 from vflatten_ros.core.config import METHODS, Config
 from vflatten_ros.core.errors import InvalidCorrespondence, VFlattenError
 from vflatten_ros.core.events import CloudDropped, Event, ItemStarted
+from vflatten_ros.core.joints import MAX_POSITION_RAD
 from vflatten_ros.core.values import Calibration, Cloud, Correspondence, View
 from vflatten_ros.goals import Task
 
 OK, INVALID_ARGUMENT, UNKNOWN_VIEW, UNKNOWN_NAME, NO_VIEWS, NO_RESULT = range(6)  # msg/Status
 NOT_ACTIVE, BUSY, CANCELLED, FAILED, PARTLY, NOT_SEEN = range(6, 12)
 
-MAX_PAIRS = 10_000
+MAX_PAIRS = 1000  # held, and in one request: each is looked up in its views, 1 ms or so
 MAX_IDS = 100_000  # in one request
 
 
@@ -46,8 +48,9 @@ class Session:
         self, stamp_ns: int, names: Sequence[str], positions: Sequence[float], now_ns: int
     ) -> tuple[Event, ...]:
         """Take one joint state."""
-        known = dict(zip(names, positions, strict=False))
-        self.wrist_rad = known.get(self.calibration.joint, self.wrist_rad)
+        wrist = dict(zip(names, positions, strict=False)).get(self.calibration.joint, math.nan)
+        if abs(wrist) <= MAX_POSITION_RAD:
+            self.wrist_rad = float(wrist)
         return self._noted(self.buffer.add_joint(stamp_ns, names, positions, now_ns))
 
     def add_cloud(self, cloud: Cloud, now_ns: int) -> tuple[Event, ...]:
@@ -123,14 +126,14 @@ class Session:
         return [self._add_pair(pair, views) for pair in pairs]
 
     def _add_pair(self, fields: Mapping[str, Any], views: Mapping[int, View]) -> tuple[int, str]:
+        if len(self.pairs) >= MAX_PAIRS:
+            return 0, f"there are {MAX_PAIRS} pairs already; clear some"
         try:
             pair = messages.correspondence_from_fields(fields, views)
         except InvalidCorrespondence as error:
             return 0, str(error)
         if pair in self.pairs.values():
             return 0, "the same pair is already there"
-        if len(self.pairs) >= MAX_PAIRS:
-            return 0, f"there are {MAX_PAIRS} pairs already; clear some"
         self.pairs[self._next_pair] = pair
         self._next_pair += 1
         return self._next_pair - 1, ""

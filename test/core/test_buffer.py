@@ -316,6 +316,23 @@ def test_fingers_that_open_and_close_start_a_new_item():
     assert check_accounts(buffer).clouds_received == 2
 
 
+def test_other_settings_and_absurd_positions_do_not_make_open_fingers_forget_that_they_are():
+    buffer = make()
+    names = ("wrist", "finger_left", "finger_right")
+    joints(buffer, 0, 1, names=names, extra=(0.03, 0.03))
+    buffer.add_joint(1 * S, names[1:], (float("nan"), float("inf")), 0)
+    buffer.configure(config_from({"buffer.max_views": 50}))
+    assert dropped([*buffer.add_cloud(cloud(int(1.1 * S)), 0), *joints(buffer, 1, 2)]) == [
+        "gripper_open"
+    ]
+    buffer.configure(config_from({"buffer.finger_joints": "finger_right"}))
+    events = [
+        *buffer.add_joint(2 * S, names[1:], (0.03, 0.001), 0),
+        *joints(buffer, 2, 3, names=names, extra=(0.03, 0.001)),
+    ]
+    assert ItemStarted(2, "the fingers closed") in events
+
+
 def test_a_new_item_on_request_forgets_the_views():
     buffer = make()
     turn_round(buffer, 12)

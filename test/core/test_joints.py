@@ -91,6 +91,7 @@ def test_repeated_stamps_and_bad_positions_are_refused():
     assert not track.add(20 * MS, 9.0)
     assert not track.add(40 * MS, float("nan"))
     assert not track.add(40 * MS, float("inf"))
+    assert not track.add(40 * MS, 1e300)
     assert angle_at(track, 10) == pytest.approx(0.1)
 
 

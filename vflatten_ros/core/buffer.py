@@ -83,8 +83,7 @@ class ViewBuffer:
 
     def configure(self, config: Config) -> None:
         """Use other settings from now on; views and joint states so far stay."""
-        if config.buffer != self._config.buffer:
-            self._fingers = FingerWatch(config.buffer)
+        self._fingers.configure(config.buffer)
         self._track.configure(config.joints)
         self._config = config
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Mapping
 
@@ -14,12 +15,16 @@ class FingerWatch:
     """Opening and closing of the fingers, with hysteresis between two thresholds."""
 
     def __init__(self, config: BufferConfig) -> None:
+        self.configure(config)
+        self._latest: dict[str, float | None] = {}
+        self._newest_ns: int | None = None
+        self._changes: list[tuple[int, bool]] = []  # stamp, whether open from then on
+
+    def configure(self, config: BufferConfig) -> None:
+        """Use other joints or thresholds from now on; how the fingers are stays."""
         self._joints = [name.strip() for name in config.finger_joints.split(",") if name.strip()]
         self._open_above = config.finger_open
         self._closed_below = min(config.finger_closed, config.finger_open)
-        self._latest: dict[str, float] = {}
-        self._newest_ns: int | None = None
-        self._changes: list[tuple[int, bool]] = []  # stamp, whether open from then on
 
     def clear(self) -> None:
         """Forget when the fingers moved; how they are now stays."""
@@ -32,11 +37,13 @@ class FingerWatch:
         if self._newest_ns is not None and stamp_ns <= self._newest_ns:
             return None
         own = {name: float(positions[name]) for name in self._joints if name in positions}
+        own = {name: position for name, position in own.items() if math.isfinite(position)}
         if not own:
             return None
         self._newest_ns = stamp_ns
-        self._latest.update(own)
-        mean = sum(self._latest.values()) / len(self._latest)
+        self._latest = {name: own.get(name, self._latest.get(name)) for name in self._joints}
+        known = [position for position in self._latest.values() if position is not None]
+        mean = sum(known) / len(known)
         was_open = bool(self._changes) and self._changes[-1][1]
         if not was_open and mean > self._open_above:
             self._change(stamp_ns, True)

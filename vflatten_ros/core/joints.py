@@ -13,6 +13,7 @@ TURN = 2.0 * math.pi
 # Noise at the wrap of a joint that reports 0 to 2 pi, or -pi to pi, stays within this.
 WRAP_TOLERANCE_RAD = 0.2
 MAX_SAMPLES = 200_000
+MAX_POSITION_RAD = 1e4  # 1600 turns; beyond that a driver's mistake, which would end unwrapping
 
 
 class JointStatus(Enum):
@@ -82,8 +83,8 @@ class JointTrack:
         self._turns.clear()
 
     def add(self, stamp_ns: int, position_rad: float) -> bool:
-        """Add one sample; False if not finite, of a stamp already there, or before the history."""
-        if not math.isfinite(position_rad):
+        """Add one sample; False if absurd, of a stamp already there, or before the history."""
+        if not abs(position_rad) <= MAX_POSITION_RAD:
             return False
         place = bisect_left(self._stamps, stamp_ns)
         if place < len(self._stamps) and self._stamps[place] == stamp_ns:

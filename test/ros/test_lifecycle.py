@@ -2,11 +2,14 @@
 
 import pytest
 import rclpy
+import slow_work
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import ParameterType
 from ros_rig import CALIBRATION, REAL, Process, Rig
 from sensor_msgs.msg import JointState
 from vflatten_ros.msg import Status
+
+from vflatten_ros.flatten_node import FlattenNode
 
 UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = 1, 2, 3, 4
 CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
@@ -156,14 +159,62 @@ def test_a_publisher_that_cannot_reach_the_node_is_named_with_the_remedy(rig):
     rig.planner.destroy_publisher(publisher)
 
 
-def test_a_finalized_node_still_answers(rig):
-    bring(rig, INACTIVE)
-    assert change(rig, 6)
+@pytest.mark.parametrize("state, shutdown", [(UNCONFIGURED, 5), (ACTIVE, 7), (INACTIVE, 6)])
+def test_a_finalized_node_still_answers(rig, state, shutdown):
+    if not rig.node.running():
+        rig.start(wait=False)
+        rig.until(lambda: rig.lifecycle_state() == UNCONFIGURED, "the node")
+    rig.set_parameter("calibration.file", str(CALIBRATION))
+    bring(rig, state)
+    assert change(rig, shutdown)
     for transition in ALL:
         assert not change(rig, transition)
     assert rig.lifecycle_state() == FINALIZED
+    assert not rig.node.children()  # the flattening process is gone
     assert rig.ask("new_item").message.startswith("the node is finalized")
     assert rig.node.stop() == 0
+
+
+def test_who_waits_for_a_result_is_answered_when_the_node_is_taken_down(ros, tmp_path):
+    rig = Rig(tmp_path, arguments=["--calibration", str(CALIBRATION)])
+    try:
+        rig.set_parameter("auto_flatten", False)
+        rig.set_parameter("geodesics.nodes", slow_work.STUBBORN)
+        for transitions in ([DEACTIVATE], [DEACTIVATE, CLEANUP]):
+            rig.turn()
+            rig.until(lambda: rig.buffer().views, "views")
+            goals = [rig.send_goal(view_ids=ids) for ids in ([1, 2], [3, 4])]
+            rig.until(lambda: rig.ask("state").flattening, "the work to begin")
+            for transition in transitions:
+                assert change(rig, transition)
+            for goal in goals:
+                answer = rig.result_of(goal.get_result_async())
+                assert answer.result.status.code == Status.CANCELLED
+                assert "deactivated" in answer.result.status.message
+            bring(rig, ACTIVE)
+            rig.reconnect()
+        rig.set_parameter("geodesics.nodes", slow_work.GOOD)
+        rig.serves_a_good_rotation()
+    finally:
+        rig.close()
+
+
+def test_a_mistake_of_ours_in_a_transition_leads_back_to_unconfigured(ros):
+    trouble = [ZeroDivisionError("a mistake of ours")]
+
+    def loader(folder):
+        if trouble:
+            raise trouble.pop()
+        return slow_work.load
+
+    node = FlattenNode("mistaken", loader=loader)
+    try:
+        node.trigger_configure()
+        assert node.lifecycle_state()[0] == UNCONFIGURED
+        node.trigger_configure()
+        assert node.lifecycle_state()[0] == INACTIVE
+    finally:
+        node.destroy_node()
 
 
 @pytest.mark.parametrize(

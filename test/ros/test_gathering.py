@@ -1,0 +1,189 @@
+"""What becomes of every cloud: each reason to drop one, as a planner and an operator see it."""
+
+import numpy as np
+from lifecycle_msgs.msg import Transition
+from ros_rig import CALIBRATION, Process, Rig
+from sensor_msgs.msg import JointState, PointCloud2, PointField
+
+from vflatten_ros.core.events import DROP_REASONS, REMEDIES
+
+START_S = 1_800_000_000
+FIELDS = [
+    PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
+    for i, name in enumerate("xyz")
+]
+OPEN, CLOSED = 0.04, 0.0
+
+
+def stamped(header, at_s):
+    header.stamp.sec = START_S + int(at_s)
+    header.stamp.nanosec = round(at_s % 1 * 1e9)
+
+
+def strip(at_s, shift_m=0.0, frame="rig_optical", **lies):
+    """A strip of cloth below the gripper, 4 mm between points."""
+    row, col = np.mgrid[:60, :30]
+    xyz = np.stack([0.004 * (col - 15) + shift_m, 0.004 * row - 0.48, np.full(row.shape, 1.3)], 2)
+    message = PointCloud2(height=60, width=30, fields=FIELDS, point_step=12, row_step=360)
+    message.header.frame_id = frame
+    stamped(message.header, at_s)
+    message.data = xyz.astype("<f4").tobytes()
+    for name, value in lies.items():
+        setattr(message, name, value)
+    return message
+
+
+class Turning:
+    """A wrist that turns as told, and a camera that looks at a strip of cloth."""
+
+    def __init__(self, rig):
+        self.rig, self.now_s, self.position, self.clouds = rig, 1.0, 0.0, 0
+
+    def turn(self, seconds, rate=0.0, fingers=CLOSED):
+        """Joint states at 50 Hz."""
+        for _ in range(round(seconds * 50)):
+            self.now_s += 0.02
+            self.position += 0.02 * rate
+            message = JointState(name=["wrist_roll", "finger_left", "finger_right"])
+            message.position = [self.position, fingers, fingers]
+            stamped(message.header, self.now_s)
+            self.rig.publish(message)
+        self.rig.buffer()  # not faster than the node takes them
+
+    def see(self, at_s, reason=None, **how):
+        """One cloud; waits until the node has decided."""
+        before = self.rig.drops()
+        self.rig.publish(strip(at_s, **how))
+        self.clouds += 1
+        self.rig.until(lambda: self.rig.settled(self.clouds), f"cloud {self.clouds}")
+        after = self.rig.drops()
+        gained = {name for name in after if after[name] != before.get(name, 0)}
+        assert gained == ({reason} if reason else set())
+
+
+def reactivate(rig):
+    for transition in (4, 3):
+        assert rig.ask("change_state", transition=Transition(id=transition)).success
+    rig.reconnect()
+
+
+def test_every_reason_to_drop_a_cloud_is_counted_reported_and_explained(rig):
+    reactivate(rig)
+    changed = {"joints.wait_s": 0.3, "buffer.max_rate_rad_s": 1.0, "buffer.max_views": 3}
+    before = {"joints.wait_s": 1.0, "buffer.max_rate_rad_s": 0.0, "buffer.max_views": 128}
+    for name, value in changed.items():
+        assert rig.set_parameter(name, value).successful
+    arm = Turning(rig)
+    arm.see(1.0, "no_joint_state")
+    arm.see(1.0, "invalid_cloud", width=4_000_000)
+    arm.see(1.0, "wrong_frame", frame="map")
+    arm.see(1.0, "empty_after_segmentation", shift_m=5.0)
+    arm.turn(2.0, rate=0.5)
+    arm.see(2.0)
+    arm.see(1.9, "time_went_backwards")
+    arm.now_s += 0.5  # no joint states meanwhile
+    arm.turn(1.0, rate=0.5)
+    arm.see(arm.now_s - 1.25, "too_old")
+    arm.turn(0.5, rate=3.0)
+    arm.see(arm.now_s - 0.2, "wrist_moving_too_fast")
+    arm.turn(2.0)
+    arm.see(arm.now_s - 1.5)
+    arm.see(arm.now_s - 1.2, "duplicate_angle")
+    arm.see(arm.now_s - 0.9, "item_swinging", shift_m=0.1)
+    arm.turn(1.0, rate=0.5)
+    arm.see(arm.now_s - 0.5)
+    arm.turn(1.0, rate=0.5)
+    arm.see(arm.now_s - 0.5, "buffer_full")
+    held = [view.id for view in rig.ask("list_views").views]
+    assert rig.ask("clear_views", ids=held[:1]).removed == 1
+    arm.turn(0.5, fingers=OPEN)
+    arm.see(arm.now_s - 0.2, "gripper_open")
+    counted = rig.check_accounts()
+    reasons = dict(zip(counted.drop_reasons, counted.drop_counts, strict=True))
+    assert reasons == dict.fromkeys(set(DROP_REASONS) - {"previous_item"}, 1)
+    shown = rig.diagnostics()["buffer"]
+    assert {name for name in shown if name.startswith("dropped: ")} == {
+        f"dropped: {name}" for name in reasons
+    }
+
+    arm.turn(1.0)  # the fingers close: the next item
+    assert rig.buffer().item == counted.item + 1
+    assert f"item {counted.item + 1} begins: the fingers closed" in rig.node.log()
+    arm.clouds = 0
+    arm.see(arm.now_s - 1.2, "previous_item")
+    arm.see(arm.now_s - 0.5)
+    assert rig.check_accounts().clouds_received == 2
+    for reason in REMEDIES:
+        assert f"dropped, {reason}: " in rig.node.log(), reason
+        assert REMEDIES[reason] in rig.node.log(), reason
+    for name, value in before.items():
+        assert rig.set_parameter(name, value).successful
+    reactivate(rig)
+    rig.serves_a_good_rotation()
+
+
+def test_a_flood_of_mistakes_does_not_flood_the_log(rig):
+    reactivate(rig)
+    lines = len(rig.node.log().splitlines())
+    for number in range(150):
+        rig.publish(strip(number, frame="map"))
+        rig.publish(strip(number, point_step=0))
+        if number % 5 == 4:
+            rig.until(lambda sent=2 * number + 2: rig.settled(sent), "the clouds so far")
+    assert rig.drops() == {"wrong_frame": 150, "invalid_cloud": 150}
+    added = rig.node.log().splitlines()[lines:]
+    assert len(added) == 2, added  # one for each reason
+    rig.serves_a_good_rotation()
+
+
+def test_two_rigs_side_by_side_each_hear_their_own(ros, tmp_path):
+    """One of them by bag time, which is another's past."""
+    recordings = [CALIBRATION.parents[1] / name for name in ("LS1_1", "TR1_1")]
+    rigs = [
+        Rig(tmp_path, arguments=["--calibration", str(folder / "calibration.yaml"), *more])
+        for folder, more in zip(
+            recordings, ([], ["--ros-args", "-p", "use_sim_time:=true"]), strict=True
+        )
+    ]
+    try:
+        for rig in rigs:
+            rig.set_parameter("geodesics.nodes", 30)
+        players = [
+            rig.play("--rate", 4, *more, recording=folder, wait=False)
+            for rig, folder, more in zip(rigs, recordings, ([], ["--clock"]), strict=True)
+        ]
+        sizes = []
+        for rig, player in zip(rigs, players, strict=True):
+            assert player.wait() == 0, player.log()
+            buffer = rig.until(rig.complete, "the rotation")
+            assert not buffer.drop_counts
+            assert rig.diagnostics()["clouds"]["received"] == "24"
+            rig.until(lambda rig=rig: "flattened in" in rig.node.log(), "flattening by itself")
+            sizes.append([view.points for view in buffer.views])
+        assert len(sizes[0]) == len(sizes[1]) == 24
+        assert all(shirt != trousers for shirt, trousers in zip(*sizes, strict=True))
+    finally:
+        for rig in rigs:
+            rig.close()
+
+
+def test_planners_as_processes_at_once_each_get_a_result(rig, tmp_path):
+    player = rig.play("--rate", 8, "--loop", wait=False)
+    rig.until(lambda: len(rig.buffer().views) > 3, "some views")
+    processes = [
+        Process(
+            [
+                "examples/planner.py",
+                str(CALIBRATION.parent),
+                *("--node", f"{rig.namespace}/vflatten", "--no-play", "--method", "rotation"),
+            ],
+            tmp_path / f"planner{number}.log",
+        )
+        for number in range(2)
+    ]
+    for process in processes:
+        assert process.wait() == 0, process.log()
+        assert "towel (quality" in process.log()
+        assert "begins" in process.log()
+    player.kill()
+    rig.serves_a_good_rotation()

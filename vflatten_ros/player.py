@@ -195,6 +195,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     node = Node("vflatten_player")
     try:
         return _play(node, recording, args)
+    except KeyboardInterrupt:
+        return 130
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

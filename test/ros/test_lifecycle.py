@@ -152,11 +152,37 @@ def test_a_publisher_that_cannot_reach_the_node_is_named_with_the_remedy(rig):
     assert rig.set_parameter("no_data_warning_s", 0.5).successful
     bring(rig, ACTIVE)
     rig.until(lambda: f"no cloud on {rig.namespace}/rig/points" in rig.node.log(), "a warning")
-    publisher = rig.planner.create_publisher(
-        JointState, "gripper/joint_states", rclpy.qos.qos_profile_sensor_data
+    publishers = [
+        rig.planner.create_publisher(
+            JointState, "gripper/joint_states", rclpy.qos.qos_profile_sensor_data
+        )
+        for _ in range(3)
+    ]
+    remedy = "set joint_states.reliability to best_effort"
+    rig.until(lambda: remedy in rig.node.log(), "the cause")
+    rig.until(
+        lambda: "QoS does not match" in rig.diagnostics()["joint states"][""], "it in diagnostics"
     )
-    rig.until(lambda: "set joint_states.reliability to best_effort" in rig.node.log(), "the cause")
-    rig.planner.destroy_publisher(publisher)
+    (line,) = [line for line in rig.node.log().splitlines() if "cannot reach this node" in line]
+    assert f"{rig.namespace}/gripper/joint_states" in line and remedy in line
+    for publisher in publishers:
+        rig.planner.destroy_publisher(publisher)
+
+
+def test_settings_from_a_file_and_over_it_those_given_by_themselves(ros, tmp_path):
+    values = "{method: kita2019, buffer.max_views: 50, calibration.file: elsewhere.yaml}"
+    file = tmp_path / "settings.yaml"
+    file.write_text("/**: {ros__parameters: " + values + "}\n")
+    arguments = ["--params-file", str(file), "--calibration", str(CALIBRATION)]
+    rig = Rig(tmp_path, arguments=[*arguments, "--ros-args", "-p", "buffer.max_views:=60"])
+    try:
+        names = ["method", "buffer.max_views", "calibration.file"]
+        method, views, calibration = rig.ask("get_parameters", names=names).values
+        assert method.string_value == "kita2019"
+        assert views.integer_value == 60
+        assert calibration.string_value == str(CALIBRATION)
+    finally:
+        rig.close()
 
 
 @pytest.mark.parametrize("state, shutdown", [(UNCONFIGURED, 5), (ACTIVE, 7), (INACTIVE, 6)])

@@ -1,0 +1,94 @@
+"""`vflatten play` gives back what was recorded, in its own time."""
+
+import itertools
+import signal
+import time
+
+import pytest
+import rclpy
+from rclpy.qos import qos_profile_sensor_data
+from ros_rig import RECORDING, Process, recorded, unused_namespace
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState, PointCloud2
+
+from vflatten_ros.bag import RecordedCloud
+
+
+class Listener:
+    """Everything that a player publishes, and when it came."""
+
+    def __init__(self):
+        self.namespace = unused_namespace()
+        self.node = rclpy.create_node("listener", namespace=self.namespace)
+        self.clouds, self.joints, self.clock, self.times = [], [], [], []
+        subscribe = self.node.create_subscription
+        subscribe(PointCloud2, "rig/points", self._on_cloud, qos_profile_sensor_data)
+        subscribe(JointState, "gripper/joint_states", self._on_joints, 1000)
+        subscribe(Clock, "clock", self._on_clock, 1000)
+
+    def _on_cloud(self, message):
+        self.clouds.append(nanoseconds(message.header.stamp))
+        self.times.append(time.monotonic())
+
+    def _on_joints(self, message):
+        self.joints.append(message.position[0])
+
+    def _on_clock(self, message):
+        self.clock.append(nanoseconds(message.clock))
+
+    def play(self, log, *options):
+        remap = ["--ros-args", "-r", f"__ns:={self.namespace}", "-r", "/clock:=clock"]
+        command = ["-m", "vflatten_ros.player", str(RECORDING), *map(str, options), *remap]
+        return Process(command, log)
+
+    def listen(self, until):
+        end = time.monotonic() + 60.0
+        while not until():
+            assert time.monotonic() < end
+            rclpy.spin_once(self.node, timeout_sec=0.05)
+
+
+def nanoseconds(stamp):
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+@pytest.fixture
+def listener(ros):
+    listener = Listener()
+    yield listener
+    listener.node.destroy_node()
+
+
+def test_a_recording_is_played_twice_with_its_clock(listener, tmp_path):
+    player = listener.play(tmp_path / "log", "--rate", 8, "--loop", 2, "--clock")
+    listener.listen(lambda: not player.running())
+    assert player.wait() == 0, player.log()
+    clouds = [m for m in recorded() if isinstance(m, RecordedCloud)]
+    joints = len(recorded()) - len(clouds)
+    assert len(listener.clouds) == 48 and listener.clouds[:24] == listener.clouds[24:]
+    assert listener.clouds[:24] == sorted(listener.clouds[:24])
+    assert len(listener.joints) == 2 * joints
+    assert f"published 48 on /rig/points, {2 * joints} on" in player.log()
+    # not faster than recorded, times the rate
+    between_s = (clouds[-1].log_ns - clouds[0].log_ns) * 1e-9 / 8
+    assert listener.times[23] - listener.times[0] > 0.9 * between_s
+    steps = [after - before for before, after in itertools.pairwise(listener.clock)]
+    assert sum(step < 0 for step in steps) == 1  # as each round begins anew
+    first_ns, last_ns = recorded()[0].log_ns, recorded()[-1].log_ns
+    assert min(listener.clock) == first_ns
+    assert 0 <= last_ns - max(listener.clock) < 20_000_000
+
+
+def test_a_player_that_is_interrupted_says_so_by_its_exit_code(listener, tmp_path):
+    player = listener.play(tmp_path / "log", "--rate", 4, "--loop")
+    listener.listen(lambda: listener.clouds)
+    assert player.stop(signal.SIGINT) == 130
+    assert not listener.clock
+    assert "Traceback" not in player.log()
+
+
+def test_a_recording_that_is_not_there_ends_with_one_line(tmp_path):
+    player = Process(["-m", "vflatten_ros.player", str(tmp_path / "none")], tmp_path / "log")
+    assert player.wait() == 1
+    (line,) = player.log().splitlines()
+    assert line.startswith("vflatten play: ") and "none" in line

@@ -47,6 +47,7 @@ from vflatten_ros.worker import Load, Outcome, Worker
 
 TICK_S = 0.05
 DIAGNOSTICS_S = 1.0
+NAMESAKE_S = 30.0  # a node that was killed stays visible for 20 s
 
 
 class FlattenNode(AnsweringLifecycleNode):
@@ -78,6 +79,7 @@ class FlattenNode(AnsweringLifecycleNode):
         self._finished = self._failed = 0
         self._failing = False
         self._last = ""
+        self._alone_at = time.monotonic()
         self._declared = Parameters(
             self, lambda: self.lifecycle_state()[0] == ACTIVE, self._on_settings
         )
@@ -240,7 +242,8 @@ class FlattenNode(AnsweringLifecycleNode):
     def _drop_line(self, event: CloudDropped) -> str:
         remedy = f"; {REMEDIES[event.reason]}" if event.reason in REMEDIES else ""
         topic = self._sensors.topic("clouds")
-        return f"{topic}: cloud {event.view_id} dropped, {event.reason}: {event.text}{remedy}"
+        cloud = f"cloud {event.view_id}" if event.view_id >= 0 else "a late cloud"
+        return f"{topic}: {cloud} dropped, {event.reason}: {event.text}{remedy}"
 
     def buffer_changed(self) -> None:
         """Publish the buffer's state and have its views at the worker."""
@@ -317,8 +320,19 @@ class FlattenNode(AnsweringLifecycleNode):
 
     def _on_diagnostics(self) -> None:
         self._activate_with_tf()
+        self._look_for_namesakes()
         self._sensors.check_quiet(self.settings.node.node.no_data_warning_s)
         self._results.publish_diagnostics(self._statuses())
+
+    def _look_for_namesakes(self) -> None:
+        """Two nodes of one name answer one another's calls, now this one, now that."""
+        now, me = time.monotonic(), (self.get_name(), self.get_namespace())
+        if self.get_node_names_and_namespaces().count(me) < 2:
+            self._alone_at = now
+        elif now - self._alone_at > NAMESAKE_S:
+            name = self.get_fully_qualified_name()
+            text = f"another node is named {name} and answers the same calls: end it, or rename"
+            self.log.warning(f"{text} one (vflatten node --name, or a namespace)", cause="namesake")
 
     def _statuses(self) -> list[Status]:
         _, label = self.lifecycle_state()

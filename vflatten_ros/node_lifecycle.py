@@ -7,7 +7,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from vflatten_ros.core.errors import VFlattenError
@@ -28,7 +27,7 @@ class AnsweringLifecycleNode(LifecycleNode):
         super().__init__(name)
         self.log = Log(self.get_logger())
         self.trouble = ""  # why the last transition failed
-        # rclpy lets an invalid request's RCLError out of spin: it would end the node, unanswered.
+        # rclpy lets an impossible request's RCLError out of spin: that ends a node, unanswered.
         change_state = self._service_change_state.callback
         self._service_change_state.callback = partial(self._answer_change_state, change_state)
 
@@ -85,15 +84,15 @@ class AnsweringLifecycleNode(LifecycleNode):
         self.cleanup()
 
     def _answer_change_state(self, change: Callable[..., Any], request: Any, response: Any) -> Any:
-        try:
+        number, label = request.transition.id, request.transition.label
+        possible = [(known, name) for known, name, *_ in self._state_machine.available_transitions]
+        if any(label == name if label else number == known for known, name in possible):
             return change(request, response)
-        except rclpy_implementation.RCLError:
-            number, state = request.transition.id, self.lifecycle_state()[1]
-            wanted = request.transition.label[:60] or f"transition {number}"
-            text = f"refused: {wanted} is not possible while {state}"
-            self.log.warning(text, cause=f"transition {number} while {state}")
-            response.success = False
-            return response
+        state = self.lifecycle_state()[1]
+        text = f"refused: {label[:60] or f'transition {number}'} is not possible while {state}"
+        self.log.warning(text, cause=f"transition {number} while {state}")
+        response.success = False
+        return response
 
     def configure(self) -> None:
         """Unconfigured to inactive."""

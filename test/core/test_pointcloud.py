@@ -151,6 +151,7 @@ LIES = {
     "tall": ({"height": ROWS + 1}, "needs .* bytes"),
     "wide": ({"width": COLS + 1}, "row_step .* less than width"),
     "absurd": ({"height": 2**32 - 1, "width": 2**32 - 1}, "at most"),
+    "absurdly many of none": ({"height": 2**32 - 1, "width": 0, "point_step": 4096}, "at most"),
     "large but plausible": ({"height": 6000, "width": 10000, "row_step": 120000}, "needs .* bytes"),
     "negative": ({"height": -1}, "height -1"),
     "point_step 0": ({"point_step": 0}, "point"),
@@ -186,7 +187,7 @@ def test_a_lying_layout_is_refused(lie):
 def test_random_headers_never_do_worse_than_invalid_cloud():
     chance = np.random.default_rng(1)
     sizes = [0, 1, 3, 7, 12, 16, 255, 2**16, 2**31, 2**32 - 1]
-    for _ in range(500):
+    for _ in range(3000):
         height, width, point_step, row_step = (int(n) for n in chance.choice(sizes, 4))
         fields = [
             PointField(str(name), int(chance.choice(sizes)), int(chance.integers(0, 10)), 1)
@@ -194,5 +195,6 @@ def test_random_headers_never_do_worse_than_invalid_cloud():
         ]
         given = message(xyz_columns())
         given.update(height=height, width=width, point_step=point_step, row_step=row_step)
+        given["data"] = bytes(int(chance.choice([0, 12, 1000])))
         with contextlib.suppress(InvalidCloud):
             decode_cloud(**{**given, "fields": fields})

@@ -1,5 +1,8 @@
 """Lifecycle and parameters: every request is answered, and a refusal says why."""
 
+import time
+from types import SimpleNamespace
+
 import pytest
 import rclpy
 import slow_work
@@ -9,6 +12,7 @@ from ros_rig import CALIBRATION, REAL, Process, Rig
 from sensor_msgs.msg import JointState
 from vflatten_ros.msg import Status
 
+from vflatten_ros import flatten_node
 from vflatten_ros.flatten_node import FlattenNode
 
 UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = 1, 2, 3, 4
@@ -223,6 +227,24 @@ def test_who_waits_for_a_result_is_answered_when_the_node_is_taken_down(ros, tmp
         rig.serves_a_good_rotation()
     finally:
         rig.close()
+
+
+def test_a_node_that_is_left_over_is_noticed(ros, monkeypatch):
+    monkeypatch.setattr(flatten_node, "NAMESAKE_S", 0.0)
+    nodes = [FlattenNode("twin"), FlattenNode("twin"), FlattenNode("single")]
+    lines = []
+    for node in nodes:
+        monkeypatch.setattr(node.log, "_logger", SimpleNamespace(warning=lines.append))
+    try:
+        end = time.monotonic() + 30.0
+        while not lines and time.monotonic() < end:
+            for node in nodes[1:]:
+                rclpy.spin_once(node, timeout_sec=0.1)
+        (line,) = lines
+        assert line.startswith("another node is named /twin and answers the same calls")
+    finally:
+        for node in nodes:
+            node.destroy_node()
 
 
 def test_a_mistake_of_ours_in_a_transition_leads_back_to_unconfigured(ros):

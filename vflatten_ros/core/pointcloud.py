@@ -106,7 +106,7 @@ def _check_sizes(height: int, width: int, point_step: int, row_step: int) -> Non
     for name, size in sizes.items():
         if size < 0:
             raise InvalidCloud(f"cloud has {name} {size}; expected 0 or more")
-    if height * width > MAX_POINTS:
+    if max(height, width, height * width) > MAX_POINTS:
         raise InvalidCloud(f"cloud claims {height} x {width} points; at most {MAX_POINTS} are read")
     if height * width and point_step == 0:
         raise InvalidCloud(f"cloud of {height} x {width} points has point_step 0")

@@ -113,6 +113,8 @@ class Bench(Node):
         goal = Flatten.Goal(method=self._method, view_ids=views or list(range(self._clouds - 1)))
         handle = self.wait(self._action.send_goal_async(goal))
         future = handle.get_result_async()
+        while not self.state().flattening:  # its process may still start after the last cancel
+            time.sleep(0.1)
         time.sleep(0.5)
         begin = time.perf_counter()
         handle.cancel_goal_async()
@@ -224,10 +226,8 @@ def main() -> int:
     bench = Bench(args.recording, args.method)
     try:
         bench.connect()
-        results, cancels = [], []
-        for _ in range(args.rounds):
-            results.append(bench.result_after_rotation(args.rate, node.pid))
-            cancels.append(bench.cancel_latency())
+        results = [bench.result_after_rotation(args.rate, node.pid) for _ in range(args.rounds)]
+        cancels = [bench.cancel_latency() for _ in range(args.rounds)]
         figures = report(results, cancels)
         if args.clouds:
             figures |= bench.memory(node.pid, args.clouds, args.memory_rate)

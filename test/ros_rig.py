@@ -31,7 +31,7 @@ RECORDING = ROOT / "bags" / "LS1_1"
 CLOUDS, JOINTS = "/rig/points", "/gripper/joint_states"  # of the recording
 CALIBRATION = RECORDING / "calibration.yaml"
 QUICK = [str(Path(__file__).parent / "ros" / "quick_node.py")]
-REAL = ["-m", "vflatten_ros.node"]
+REAL = [str(ROOT / "scripts" / "vflatten"), "node"]  # as users start it
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LIMIT_S = 60.0  # for what should take moments, on a machine that is busy
 _numbers = itertools.count(1)
@@ -225,9 +225,9 @@ class Rig:
         message = Parameter(name, value=value).to_parameter_msg()
         return self.ask("set_parameters", parameters=[message]).results[0]
 
-    def diagnostics(self):
+    def diagnostics(self, node="vflatten"):
         """Values of the next diagnostics of this node, by part."""
-        name = f"{self.namespace}/vflatten"
+        name = f"{self.namespace}/{node}"
         found = {}
 
         def keep(message):

@@ -8,7 +8,7 @@ import rclpy
 import slow_work
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import ParameterType
-from ros_rig import CALIBRATION, REAL, Process, Rig
+from ros_rig import CALIBRATION, REAL, ROOT, Process, Rig
 from sensor_msgs.msg import JointState
 from vflatten_ros.msg import Status
 
@@ -185,6 +185,29 @@ def test_settings_from_a_file_and_over_it_those_given_by_themselves(ros, tmp_pat
         assert method.string_value == "kita2019"
         assert views.integer_value == 60
         assert calibration.string_value == str(CALIBRATION)
+    finally:
+        rig.close()
+
+
+@pytest.mark.parametrize("command", ["vflatten_node", "vflatten node"])
+def test_the_installed_commands_start_one_node_that_can_flatten(ros, tmp_path, command):
+    """The flattening process imports the file of the command again: it must not run it."""
+    program, *words = command.split()
+    rig = Rig(
+        tmp_path,
+        kind=[str(ROOT / "scripts" / program), *words],
+        arguments=["--name=mine"],
+        wait=False,
+    )
+    try:
+        me = ("mine", rig.namespace)
+        rig.until(lambda: "cannot activate" in rig.node.log(), "the node")
+        rig.until(
+            lambda: rig.diagnostics("mine")["flattening"][""] == "idle", "the flattening process"
+        )
+        assert rig.planner.get_node_names_and_namespaces().count(me) == 1
+        assert "Traceback" not in rig.node.log()
+        assert rig.node.stop() == 0
     finally:
         rig.close()
 

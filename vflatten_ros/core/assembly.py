@@ -43,6 +43,7 @@ STIFF = 0.05  # of the swing that is allowed where paths along the cloth are unc
 NEAR_M = 0.02  # beyond the main piece's outline
 CUTS = (6.0, 5.0, 4.0, 3.0, 3.0, 3.0)  # of the fits of the outline, in sigmas
 USUALLY_HIDDEN, HIDDEN_SPREAD = 0.15, 0.15  # share of an item that two well-chosen views leave out
+FINEST_M = 0.001  # steps of the last search for the places of pieces
 HALF_PIXEL_M = 0.00125  # cloth reaches beyond the centres of its outermost pixels
 
 
@@ -175,9 +176,11 @@ def assemble(
         trial = _trial(prepared, fit.template, fit.pose, fit.state, config)
         trial = _alternate(prepared, trial, config, 1)
         name = fit.template.category
-        if name not in kept or trial.energy + trial.cost < kept[name].energy + kept[name].cost:
+        if name not in kept or _misfit(trial) < _misfit(kept[name]):
             kept[name] = trial
-    likely = sorted(kept.values(), key=lambda t: t.energy + t.cost)[: config.assembly.categories]
+    likely = sorted(kept.values(), key=_misfit)[: config.assembly.categories]
+    worst = _misfit(likely[0]) + config.assembly.hopeless
+    likely = [trial for trial in likely if _misfit(trial) < worst]
     found = []
     for done, trial in enumerate(likely):
         progress("recognition", 0.6 + 0.4 * done / len(likely))
@@ -186,6 +189,10 @@ def assemble(
     found.sort(key=lambda pair: -pair[0].chance)
     best = _finished(prepared, _polished(prepared, found[0][1], config), config)
     return [best, *(assembly for assembly, _ in found[1:])]
+
+
+def _misfit(trial: _Trial) -> float:
+    return trial.energy + trial.cost
 
 
 def _stiff(template: Template) -> Template:
@@ -198,12 +205,15 @@ def _first_fits(prepared: _Prepared, template: Template, config: Config) -> list
     still = _Turn(0.0, np.zeros(2), np.zeros(2))
     evidence = _ends_evidence(prepared, prepared.main, (still,), config)
     pose, state = matches(template, prepared.ends[0].uv, prepared.whole_inner, MOST_FITS)
-    pose, state, energy = refine(template, evidence, pose, state, COARSE + CUTS)
+    for cuts in (COARSE, CUTS):  # the worse half is dropped on the way
+        pose, state, energy = refine(template, evidence, pose, state, cuts)
+        first = np.argsort(energy, kind="stable")[: MOST_FITS // 2]
+        pose, state, energy = pose[first], state[first], energy[first]
     return [_Fitted(template, pose[k], state[k], float(energy[k])) for k in _distinct(pose, energy)]
 
 
 def _distinct(pose: Float, energy: Float) -> list[int]:
-    """The best of each group of alike poses, three at most."""
+    """The best of each group of alike poses, two at most."""
     chosen: list[int] = []
     for k in np.argsort(energy, kind="stable"):
         off = [
@@ -212,7 +222,7 @@ def _distinct(pose: Float, energy: Float) -> list[int]:
         ]
         if all(o.max() > 0.05 for o in off):
             chosen.append(int(k))
-    return chosen[:3]
+    return chosen[:2]
 
 
 def _prepare(flattened: Flattened, config: Config) -> _Prepared:
@@ -273,19 +283,20 @@ def _alternate(prepared: _Prepared, trial: _Trial, config: Config, times: int) -
 def _polished(prepared: _Prepared, trial: _Trial, config: Config) -> _Trial:
     """Places and outline together: every place is judged with the outline that fits it best."""
     main, *loose = prepared.flattened.pieces
-    ways = np.vstack([np.eye(3), -np.eye(3)])
     for k, piece in enumerate(loose, start=1):
         images = _images(
             [p for n, p in enumerate(trial.placed) if n != k], main.surface.uv[:3], piece
         )
-        step = np.array([0.04, 0.006, 0.006])
+        step, moves = np.array([0.04, 0.006, 0.006]), list(np.vstack([np.eye(3), -np.eye(3)]))
         best = _joint_energy(prepared, trial, k, trial.turns[k], images, config)
-        while step[1] > 0.0004:
-            turns = [trial.turns[k].by(move) for move in ways * step]
-            tried = [_joint_energy(prepared, trial, k, turn, images, config) for turn in turns]
-            least = min(range(len(tried)), key=lambda n: tried[n].energy + tried[n].cost)
-            if tried[least].energy + tried[least].cost < best.energy + best.cost - 1e-6:
-                trial = best = tried[least]
+        while step[1] > FINEST_M:
+            for n, move in enumerate(moves):
+                turn = best.turns[k].by(move * step)
+                tried = _joint_energy(prepared, best, k, turn, images, config)
+                if _misfit(tried) < _misfit(best) - 1e-6:
+                    best = tried
+                    moves.insert(0, moves.pop(n))  # what helped is tried first the next time
+                    break
             else:
                 step = step / 2
         trial = best
@@ -310,7 +321,7 @@ def _joint_energy(
     turns = (*trial.turns[:k], turn, *trial.turns[k + 1 :])
     evidence = _ends_evidence(prepared, prepared.main, turns, config)
     pose, state, energy = refine(
-        trial.template, evidence, trial.pose[None], trial.state[None], CUTS[-3:]
+        trial.template, evidence, trial.pose[None], trial.state[None], CUTS[-2:]
     )
     hinges = prepared.hinges[k - 1]
     off = np.linalg.norm(turn(hinges.here) - hinges.there, axis=1).min() / hinges.sigma_m

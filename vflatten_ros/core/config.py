@@ -320,7 +320,7 @@ class AssemblyConfig(Checked):
         high=1000.0,
     )
     alternations: int = option(
-        6,
+        3,
         "Times that pieces are placed and the outline is fitted, in turns; 0: not.",
         low=0,
         high=100,

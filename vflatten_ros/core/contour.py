@@ -92,14 +92,10 @@ def _filled(quads: Float, low: Float, shape: tuple[int, int], cell_m: float) -> 
     for count in np.unique(np.minimum(steps, 40)):
         some = quads[np.minimum(steps, 40) == count]
         t = np.linspace(0.0, 1.0, count)
-        s, t = (x.reshape(-1)[None, :, None] for x in np.meshgrid(t, t))
-        inside = (
-            some[:, None, 0] * (1 - s) * (1 - t)
-            + some[:, None, 1] * s * (1 - t)
-            + some[:, None, 2] * s * t
-            + some[:, None, 3] * (1 - s) * t
-        ).reshape(-1, 2)
-        col, row = np.rint((inside - low) / cell_m).astype(int).T
+        s, t = (x.reshape(-1) for x in np.meshgrid(t, t))
+        share = np.stack([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t])  # (4, count^2)
+        inside = (np.swapaxes(some, 1, 2).reshape(-1, 4) @ share).reshape(len(some), 2, -1)
+        col, row = np.rint((inside - low[:, None]) / cell_m).astype(int).swapaxes(0, 1)
         image[row, col] = True
     return image
 

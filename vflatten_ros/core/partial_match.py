@@ -6,8 +6,11 @@ piece's ends should lie on the outline, its cloth inside, and no part of the out
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from vflatten_ros.core.templates import Template
@@ -41,58 +44,64 @@ def matches(template: Template, ends: Float, inner: Float, count: int) -> tuple[
     """
     typical = template.outline(np.zeros(template.dimensions))
     extent, own = _diameter(inner), _diameter(typical)
-    low = inner.min(axis=0) - SIZES[-1] * extent
-    span = np.ptp(inner, axis=0) + 2 * SIZES[-1] * extent
+    # wide enough that a piece within one copy of the outline does not feel the next copy
+    span = np.ptp(inner, axis=0) + SIZES[-1] * extent + 2 * CUT_M
     shape = tuple(fft.next_fast_len(int(n), real=True) for n in np.ceil(span / CELL_M)[::-1])
     middle = np.array(shape)[::-1] * 0.5 * CELL_M
-    parts = [_spectrum(_histogram(ends, low, shape)), _spectrum(_histogram(inner, low, shape))]
-    parts.append(_spectrum(_depth(inner, low, shape)))
+    low = 0.5 * (inner.min(axis=0) + inner.max(axis=0)) - middle
+    given = [_share(ends, low, shape), _share(inner, low, shape), _depth(inner, low, shape)]
+    parts = _spectra(given)
+    angles = np.arange(ROTATIONS) * (2 * np.pi / ROTATIONS)
     poses, states, costs = [], [], []
     for size in SIZES:
         state = _scaled(template, np.log(size * extent / own))
         outline = template.outline(state)
         centre = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
-        for angle in np.arange(ROTATIONS) * (2 * np.pi / ROTATIONS):
-            turned = (outline - centre) @ _rotation(angle).T
-            image = _misfit_of_shifts(turned + middle, shape, parts)
-            row, col = np.unravel_index(int(image.argmin()), shape)
-            shift = np.array([col, row], dtype=float)
+        turned = [(outline - centre) @ _rotation(angle).T + middle for angle in angles]
+        images = _misfit_of_shifts(turned, shape, parts)
+        least = images.reshape(ROTATIONS, -1).argmin(axis=1)
+        for angle, image, at in zip(angles, images, least, strict=True):
+            row, col = np.unravel_index(int(at), shape)
             size_cells = np.array(shape)[::-1]
-            shift = (shift + size_cells // 2) % size_cells - size_cells // 2
-            at = shift * CELL_M + middle + low
-            poses.append(np.r_[angle, at - _rotation(angle) @ centre])
+            shift = (np.array([col, row]) + size_cells // 2) % size_cells - size_cells // 2
+            place = shift * CELL_M + middle + low
+            poses.append(np.r_[angle, place - _rotation(angle) @ centre])
             states.append(state)
             costs.append(image[row, col])
     best = np.argsort(costs, kind="stable")[:count]
     return np.array(poses)[best], np.array(states)[best]
 
 
-def _misfit_of_shifts(outline: Float, shape: tuple[int, ...], parts: list[Float]) -> Float:
-    """(rows, cols) misfit of the outline moved by every shift of the image."""
-    body = np.zeros(shape, dtype=np.uint8)
-    edge = np.zeros(shape, dtype=np.uint8)
-    cells = np.rint(outline / CELL_M * 16).astype(np.int32)
-    cv2.fillPoly(body, [cells], (1,), shift=4)
-    cv2.polylines(edge, [cells], isClosed=True, color=(1,), shift=4)
-    off = _capped(cv2.distanceTransform(1 - edge, cv2.DIST_L2, 3))
-    out = np.where(body > 0, 0.0, off)
-    total = np.conj(_spectrum(off)) * parts[0] + np.conj(_spectrum(out)) * parts[1]
-    total += np.conj(_spectrum(edge.astype(float) * 2.0 * CELL_M)) * parts[2]
-    image: Float = fft.irfft2(total, shape)
-    return image
+def _misfit_of_shifts(
+    outlines: Sequence[Float], shape: tuple[int, ...], parts: NDArray[np.complex64]
+) -> NDArray[np.float32]:
+    """(n, rows, cols) misfit of each outline moved by every shift of the image."""
+    images = np.empty((len(outlines), 3, *shape), dtype=np.float32)
+    for outline, (off, out, edge) in zip(outlines, images, strict=True):
+        body, line = np.zeros(shape, dtype=np.uint8), np.ones(shape, dtype=np.uint8)
+        cells = np.rint(outline / CELL_M * 16).astype(np.int32)
+        cv2.fillPoly(body, [cells], (1,), shift=4)
+        cv2.polylines(line, [cells], isClosed=True, color=(0,), shift=4)
+        off[:] = _capped(cv2.distanceTransform(line, cv2.DIST_L2, 3))
+        out[:] = off * (body == 0)
+        edge[:] = (1 - line) * (2.0 * CELL_M)
+    total = (np.conj(_spectra(images)) * parts).sum(axis=1)
+    found: NDArray[np.float32] = fft.irfft2(total, shape)
+    return found
 
 
-def _capped(distance: Float) -> Float:
-    result: Float = np.square(np.minimum(distance * CELL_M / CUT_M, 1.0))
+def _capped(distance: NDArray[np.float32]) -> NDArray[np.float32]:
+    result: NDArray[np.float32] = np.square(np.minimum(distance * (CELL_M / CUT_M), 1.0))
     return result
 
 
-def _spectrum(image: Float) -> Float:
-    out: Float = fft.rfft2(image.astype(np.float32))
+def _spectra(images: Sequence[Float] | NDArray[np.float32]) -> NDArray[np.complex64]:
+    """(..., rows, cols) spectra of images, in single precision: shifts are compared, no more."""
+    out: NDArray[np.complex64] = fft.rfft2(np.asarray(images, dtype=np.float32))
     return out
 
 
-def _histogram(points: Float, low: Float, shape: tuple[int, ...]) -> Float:
+def _share(points: Float, low: Float, shape: tuple[int, ...]) -> Float:
     """Share of the points in every cell."""
     col, row = np.rint((points - low) / CELL_M).astype(int).T
     image = np.zeros(shape)

@@ -9,6 +9,7 @@ related to their neighbours, and the views are joined by all cloth that both sho
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,8 +118,10 @@ def _observe_pair(
         (c.pixel_a, c.pixel_b) if c.view_a == first.view_id else (c.pixel_b, c.pixel_a)
         for c in given
     ]
-    a = observe(first, config, lambda stage, share: progress(stage, 0.5 * share))
-    b = observe(second, config, lambda stage, share: progress(stage, 0.5 + 0.5 * share))
+    with ThreadPoolExecutor(1) as other:  # numpy leaves the interpreter free for the second core
+        waiting = other.submit(observe, second, config, no_progress)
+        a = observe(first, config, progress)
+        b = waiting.result()
     reach = config.integration.pair_reach_px
     at_a = np.array([locate(a, p, reach) for p, _ in pixels])
     at_b = np.array([locate(b, q, reach) for _, q in pixels])

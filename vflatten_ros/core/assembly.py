@@ -57,6 +57,7 @@ class Assembly:
     evidence: Evidence  # the ends of all pieces
     flattened: Flattened  # in one piece
     chance: float  # logarithm, up to a constant that all categories share
+    placing: Float | None = None  # (3 + m, 3 + m) covariance that the pieces' places bring
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +188,10 @@ def assemble(
         trial = _alternate(prepared, trial, config, config.assembly.alternations - 1)
         found.append((_finished(prepared, trial, config), trial))
     found.sort(key=lambda pair: -pair[0].chance)
-    best = _finished(prepared, _polished(prepared, found[0][1], config), config)
+    polished = _polished(prepared, found[0][1], config)
+    best = replace(
+        _finished(prepared, polished, config), placing=_placing(prepared, polished, config)
+    )
     return [best, *(assembly for assembly, _ in found[1:])]
 
 
@@ -307,6 +311,26 @@ def _polished(prepared: _Prepared, trial: _Trial, config: Config) -> _Trial:
         ]
         trial = replace(trial, placed=tuple(placed))
     return trial
+
+
+def _placing(prepared: _Prepared, trial: _Trial, config: Config) -> Float:
+    """Covariance of pose and cut, as the places of the loose pieces are uncertain."""
+    turn, shift = config.assembly.turn_rad, config.assembly.shift_m
+    start = np.r_[trial.pose, trial.state]
+    total = np.zeros((len(start), len(start)))
+    for k in range(1, len(trial.turns)):
+        for step in np.diag([turn, shift, shift]):
+            moved = []
+            for way in (step, -step):
+                turns = (*trial.turns[:k], trial.turns[k].by(way), *trial.turns[k + 1 :])
+                evidence = _ends_evidence(prepared, prepared.main, turns, config)
+                pose, state, _ = refine(
+                    trial.template, evidence, trial.pose[None], trial.state[None], CUTS[-3:]
+                )
+                moved.append(np.r_[pose[0], state[0]])
+            slope = 0.5 * (moved[0] - moved[1])
+            total += np.outer(slope, slope)
+    return total
 
 
 def _joint_energy(

@@ -353,6 +353,12 @@ class AssemblyConfig(Checked):
     sigma_m: float = option(
         0.006, "Error of the outline where pieces were placed, one sigma, m.", low=0.0, high=0.1
     )
+    turn_rad: float = option(
+        0.1, "How far a placed piece may be turned wrongly, one sigma, rad.", low=0.0, high=1.0
+    )
+    shift_m: float = option(
+        0.02, "How far a placed piece may be off, one sigma, m.", low=0.0, high=0.2
+    )
 
 
 @dataclass(frozen=True)
@@ -421,6 +427,20 @@ class MeasurementConfig(Checked):
         "Points of one flat place farther apart in 3-D lie on two layers, m.",
         low=0.002,
         high=0.5,
+    )
+    few_views_factor: float = option(
+        1.6,
+        "Factor on the deviations of what one or two views give: edges err as a whole there, "
+        "where cloth is hidden in folds; measured over recordings.",
+        low=1.0,
+        high=10.0,
+    )
+    unseen_share: float = option(
+        0.08,
+        "Share of a size, one sigma, that lies beyond what is seen, where no view shows its end; "
+        "measured over recordings.",
+        low=0.0,
+        high=1.0,
     )
     low_coverage: float = option(
         0.75, "Share of the item seen below which the result says so.", low=0.0, high=1.0

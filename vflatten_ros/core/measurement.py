@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from vflatten_ros.core.templates import Float
 from vflatten_ros.core.values import FlatPoints, Int, Landmark, Measurement, Notice, Outline
 
 CELL_M = 0.01  # of the area counted as seen
+FEW = 2  # views from which outlines err along whole edges
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,9 @@ def measure(
     if fit is None or recognition.category == UNKNOWN:
         notice = Notice("untrusted", "no category fits the item; sizes are not given")
         return Measured((), (), 0.0, 0.0, (notice,))
-    measurements = sizes(fit)
+    if len(np.unique(points.view_id[points.view_id >= 0])) <= FEW:
+        fit = replace(fit, covariance=config.few_views_factor**2 * fit.covariance)
+    measurements = sizes(fit, config)
     coverage = covered(fit, points)
     quality = _quality(recognition, fit, measurements, coverage)
     return Measured(
@@ -62,7 +65,7 @@ def measure(
     )
 
 
-def sizes(fit: Fit) -> tuple[Measurement, ...]:
+def sizes(fit: Fit, config: MeasurementConfig) -> tuple[Measurement, ...]:
     """Every size of the fitted category, width and length first."""
     template = fit.template
     found = template.measure(fit.state, fit.covariance[3:, 3:])
@@ -73,7 +76,9 @@ def sizes(fit: Fit) -> tuple[Measurement, ...]:
         value, sigma = found[name]
         path = template.paths[name][0]
         ends = (_pair(placed[path[0]]), _pair(placed[path[-1]]))
-        result.append(Measurement(name, value, sigma, not _seen(fit, name), ends))
+        seen = _seen(fit, name)
+        sigma = sigma if seen else float(np.hypot(sigma, config.unseen_share * value))
+        result.append(Measurement(name, value, sigma, not seen, ends))
     return tuple(result)
 
 
@@ -196,7 +201,10 @@ def _layer(xyz: Float, distance: Float, gap: float) -> Float:
 def _quality(
     recognition: Recognition, fit: Fit, measurements: tuple[Measurement, ...], coverage: float
 ) -> float:
-    relative = max(m.sigma_m / m.value_m for m in measurements[:2])
+    """Of the category and the sizes that may be used: those not seen have a notice of their own."""
+    both = measurements[:2]
+    used = [size for size in both if not size.inferred] or both
+    relative = max(size.sigma_m / size.value_m for size in used)
     doubt = relative / 0.05 + (1.0 - coverage) + (1.0 - fit.explained)
     return float(recognition.probabilities[recognition.category] * np.exp(-0.5 * doubt))
 
@@ -212,7 +220,8 @@ def _notices(
     for size in measurements[:2]:
         if size.inferred:
             text = (
-                f"{size.name} {size.value_m:.3f} m rests on a part of the item that no view shows"
+                f"{size.name} {size.value_m:.3f} m rests on a part of the item that no view shows: "
+                "do not rely on it"
             )
             notices.append(Notice(f"{size.name}_unseen", text))
     if coverage < config.low_coverage:

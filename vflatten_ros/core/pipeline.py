@@ -224,6 +224,8 @@ def _recognised(
     tried = assemble(flattened, templates, config, progress)
     best = tried[0]
     fit = finish(best.template, best.evidence, best.pose[None], best.state[None])
+    if best.placing is not None:
+        fit = replace(fit, covariance=fit.covariance + best.placing)
     unknown = -FREEDOM - config.recognition.unknown_misfit * 2.0 * best.evidence.total
     odds = {t.template.category: np.exp(t.chance - best.chance) for t in tried}
     odds[UNKNOWN] = np.exp(unknown - best.chance)

@@ -1,0 +1,89 @@
+"""Sizes of a rectangle whose ends are seen or not, from few views or many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vflatten_ros.categories import load_templates
+from vflatten_ros.core.config import MeasurementConfig, RecognitionConfig
+from vflatten_ros.core.measurement import measure
+from vflatten_ros.core.recognition import recognise
+from vflatten_ros.core.values import FlatPoints, Outline
+
+WIDTH_M, LENGTH_M, STEP_M = 0.34, 0.60, 0.005
+TOWEL = tuple(t for t in load_templates() if t.category == "towel")
+
+
+def rectangle(*, top_seen: bool) -> Outline:
+    """Counter-clockwise from the origin; the upper side is 'top'."""
+    u, v = np.arange(0, WIDTH_M, STEP_M), np.arange(0, LENGTH_M, STEP_M)
+    sides = [
+        np.column_stack([u, 0 * u]),
+        np.column_stack([0 * v + WIDTH_M, v]),
+        np.column_stack([WIDTH_M - u, 0 * u + LENGTH_M]),
+        np.column_stack([0 * v, LENGTH_M - v]),
+    ]
+    inferred = np.repeat([False, False, not top_seen, False], [len(side) for side in sides])
+    return Outline(np.vstack(sides), np.where(inferred, 0.03, 0.002), inferred)
+
+
+def cloth(views: int) -> FlatPoints:
+    """Points all over the rectangle, of so many views in turn."""
+    u, v = np.meshgrid(np.arange(0.005, WIDTH_M, 0.01), np.arange(0.005, LENGTH_M, 0.01))
+    uv = np.column_stack([u.ravel(), v.ravel()])
+    n = len(uv)
+    return FlatPoints(
+        uv=uv,
+        xyz_hanger=np.column_stack([uv, np.zeros(n)]),
+        view_id=np.arange(n) % views,
+        pixel=np.zeros((n, 2), dtype=np.int64),
+        sigma_m=np.full(n, 0.002),
+        stress=np.zeros(n),
+        inferred=np.zeros(n, dtype=bool),
+    )
+
+
+def measured(*, top_seen=True, views=2, **settings):
+    outline, points = rectangle(top_seen=top_seen), cloth(views)
+    found = recognise(outline, points, TOWEL, RecognitionConfig())
+    result = measure(found, outline, points, MeasurementConfig(**settings))
+    return result, {size.name: size for size in result.measurements}
+
+
+def codes(result) -> set[str]:
+    return {notice.code for notice in result.notices}
+
+
+def test_sizes_that_are_seen_are_right_and_not_flagged():
+    result, size = measured()
+    assert size["width"].value_m == pytest.approx(WIDTH_M, abs=0.003)
+    assert size["length"].value_m == pytest.approx(LENGTH_M, abs=0.003)
+    assert not size["width"].inferred and not size["length"].inferred
+    assert codes(result) == set()
+
+
+def test_a_length_whose_end_no_view_shows_is_flagged_and_uncertain():
+    result, size = measured(top_seen=False)
+    assert size["length"].inferred and not size["width"].inferred
+    assert "length_unseen" in codes(result)
+    share = size["length"].sigma_m / size["length"].value_m
+    assert share > MeasurementConfig().unseen_share
+    assert size["width"].sigma_m < 0.02 * WIDTH_M  # what is seen stays certain
+
+
+def test_the_size_that_is_seen_decides_on_trust():
+    result, _ = measured(top_seen=False, unseen_share=0.9)
+    assert "untrusted" not in codes(result)
+    result, _ = measured(top_seen=False, trusted_quality=1.0)
+    assert "untrusted" in codes(result)
+
+
+def test_few_views_make_sizes_and_places_less_certain_than_many():
+    few, few_sizes = measured(views=2, few_views_factor=3.0)
+    many, many_sizes = measured(views=3, few_views_factor=3.0)
+    for name in ("width", "length"):
+        assert few_sizes[name].value_m == pytest.approx(many_sizes[name].value_m)
+        assert few_sizes[name].sigma_m == pytest.approx(3.0 * many_sizes[name].sigma_m)
+    ratio = [a.uv_sigma_m / b.uv_sigma_m for a, b in zip(few.landmarks, many.landmarks)]
+    assert ratio == pytest.approx(np.full(len(ratio), 3.0))

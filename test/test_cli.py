@@ -218,14 +218,20 @@ def assert_one_line(run, *parts):
 
 
 def test_a_recording_that_does_not_exist(tmp_path):
-    assert_one_line(vflatten("replay", tmp_path / "none"), "calibration.yaml", "no such file")
+    assert_one_line(vflatten("replay", tmp_path / "none"), "none: no such recording")
+
+
+def test_a_recording_without_a_calibration(tmp_path):
+    bag = copy(tmp_path / "bag")
+    (bag / "calibration.yaml").unlink()
+    assert_one_line(vflatten("replay", bag), "calibration.yaml: no such file", "--calibration")
 
 
 def test_a_truncated_recording_without_any_cloud(tmp_path):
     bag = copy(tmp_path / "bag")
     whole = (bag / "bag.mcap").read_bytes()
     (bag / "bag.mcap").write_bytes(whole[:3000])
-    assert_one_line(vflatten("replay", bag), "bag.mcap")
+    assert_one_line(vflatten("replay", bag), "bag.mcap", "(EndOfFile)")
 
 
 def test_a_recording_without_clouds(tmp_path):
@@ -285,13 +291,14 @@ def test_what_can_be_worked_round_is_counted_and_the_rest_goes_on(tmp_path):
         (lambda pairs: [], "0 of 0 corresponding points are usable, at least 2"),
         (lambda pairs: pairs[:1], "1 of 1 corresponding points are usable, at least 2"),
         (lambda pairs: [{"a": [2, 2], "b": [3, 3]}] * 3, "not on the item"),
+        (lambda pairs: [{"a": [2, 2], "b": [3, 3]}] * 3, "; and 2 more"),
         (lambda pairs: [{"a": [2000, 2], "b": [3, 3]}] * 3, "outside view 17"),
         (lambda pairs: [{"a": "x"}], "expected 'views'"),
     ],
 )
 def test_correspondences_that_do_not_serve(tmp_path, pairs, says):
     protocol = edited_protocol(tmp_path, pairs)
-    assert_one_line(vflatten("replay", BAG, "--protocol", protocol), says)
+    assert_one_line(vflatten("replay", BAG, "--protocol", protocol), f"{protocol}: ", says)
 
 
 @pytest.mark.parametrize(
@@ -310,6 +317,11 @@ def test_calibrations_that_describe_no_rig(tmp_path, changes, says):
 def test_a_view_that_does_not_exist():
     run = vflatten("replay", BAG, "--views", "3,99", "--method", "kita2019")
     assert_one_line(run, "cloud 99 gave no view")
+
+
+def test_one_view_is_too_few_for_the_automatic_method():
+    run = vflatten("replay", BAG, "--views", "3")
+    assert_one_line(run, "needs two views or more, got 1", "--method kita2019")
 
 
 def test_an_output_that_cannot_be_written(tmp_path):

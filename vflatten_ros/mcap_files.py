@@ -151,5 +151,6 @@ def _streamed(
 
 
 def one_line(error: BaseException) -> str:
-    """An error's type and text without line breaks."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    """An error's type and, if it has one, its text, without line breaks."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -11,7 +11,13 @@ from vflatten_ros.bag import Recording, gather_views, open_recording
 from vflatten_ros.categories import load_templates
 from vflatten_ros.cloud_files import cloud_to_view, load_cloud_file
 from vflatten_ros.core.config import Config
-from vflatten_ros.core.errors import EmptyView, InvalidCloud, InvalidCorrespondence, NotEnoughViews
+from vflatten_ros.core.errors import (
+    EmptyView,
+    InvalidCloud,
+    InvalidCorrespondence,
+    InvalidRecording,
+    NotEnoughViews,
+)
 from vflatten_ros.core.pipeline import flatten_garment
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import Correspondence, FlatGarment, Progress, View, no_progress
@@ -72,6 +78,8 @@ def replay_recording(
     """
     progress("open", 0.0)
     templates = load_templates()
+    if not path.exists():
+        raise InvalidRecording(f"{path}: no such recording; give a rosbag2 folder or an .mcap file")
     rig = load_calibration(calibration or calibration_beside(path))
     chosen, pairs = load_protocol(protocol) if protocol else ((), ())
     wanted = tuple(view_ids) or chosen
@@ -81,7 +89,12 @@ def replay_recording(
         warn(text)
     state = buffer.state()
     views = _select(buffer.views(), wanted, recording)
-    kept = _check_pairs(pairs, views, FEWEST_PAIRS if protocol else 0, warn)
+    if config.method == "rotation" and len(views) < 2:
+        raise NotEnoughViews(
+            f"{path}: method rotation needs two views or more, got {len(views)}; use more of them, "
+            "or flatten what one view shows with --method kita2019"
+        )
+    kept = _check_pairs(pairs, views, protocol, warn)
     garment = flatten_garment(views, kept, templates, config, progress)
     return Replayed(
         garment=garment,
@@ -151,7 +164,7 @@ def _select(views: Sequence[View], wanted: Sequence[int], recording: Recording) 
 def _check_pairs(
     pairs: Sequence[Correspondence],
     views: Sequence[View],
-    fewest: int,
+    protocol: Path | None,
     warn: Callable[[str], None],
 ) -> tuple[Correspondence, ...]:
     """The corresponding points that lie on the item; InvalidCorrespondence if they are too few."""
@@ -163,11 +176,11 @@ def _check_pairs(
             kept.append(checked_correspondence(pair, by_id))
         except InvalidCorrespondence as error:
             refused.append(f"corresponding point {number} left out: {error}")
-    if len(kept) < fewest:
-        reasons = "; ".join(refused) or "give more pairs"
+    if protocol is not None and len(kept) < FEWEST_PAIRS:
+        more = f"; and {len(refused) - 1} more" if len(refused) > 1 else ""
         raise InvalidCorrespondence(
-            f"{len(kept)} of {len(pairs)} corresponding points are usable, "
-            f"at least {fewest} are needed; {reasons}"
+            f"{protocol}: {len(kept)} of {len(pairs)} corresponding points are usable, at least "
+            f"{FEWEST_PAIRS} are needed; {refused[0] + more if refused else 'give more pairs'}"
         )
     for text in refused:
         warn(text)

@@ -18,6 +18,7 @@ from vflatten_ros.categories import load_templates
 from vflatten_ros.core.calibration import calibration_from
 from vflatten_ros.core.errors import InvalidCloud, InvalidConfig
 from vflatten_ros.core.events import (
+    CLOCK_SET_BACK,
     REMEDIES,
     ClockJumped,
     CloudDropped,
@@ -229,7 +230,9 @@ class FlattenNode(AnsweringLifecycleNode):
     def _note(self, event: Event) -> None:
         if isinstance(event, ItemStarted):
             self.last_garment = None
-            self.log.info(f"item {event.item} begins: {event.cause}")
+            # a clock that goes to and fro, as with two publishers, begins item after item
+            cause = event.cause if event.cause == CLOCK_SET_BACK else ""
+            self.log.info(f"item {event.item} begins: {event.cause}", cause)
         elif isinstance(event, RotationComplete):
             self.log.info(f"rotation complete: {event.views} views")
         elif isinstance(event, ClockJumped):

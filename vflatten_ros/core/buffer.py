@@ -20,6 +20,7 @@ import numpy as np
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import EmptyView
 from vflatten_ros.core.events import (
+    CLOCK_SET_BACK,
     DROP_REASONS,
     BufferState,
     ClockJumped,
@@ -235,7 +236,7 @@ class ViewBuffer:
         self._clock_jumps += 1
         events: list[Event] = [ClockJumped(from_ns, to_ns)]
         self._waiting = early
-        return events + self._start_item("the clock was set back", min(to_ns, from_ns))
+        return events + self._start_item(CLOCK_SET_BACK, min(to_ns, from_ns))
 
     # ---- clouds
 

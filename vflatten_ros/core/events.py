@@ -34,6 +34,8 @@ REMEDIES: Mapping[str, str] = {
     "invalid_cloud": "correct the camera driver",
 }
 
+CLOCK_SET_BACK = "the clock was set back"  # a cause of ItemStarted
+
 
 @dataclass(frozen=True)
 class ViewAdded:

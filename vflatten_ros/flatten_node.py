@@ -256,18 +256,10 @@ class FlattenNode(AnsweringLifecycleNode):
                 self.goals.keep(self.session.buffer.views(), self.settings.core)
 
     def _on_clock_jump(self, jump: Any) -> None:
-        """ROS time went back: views from the future cannot be followed by others.
-
-        Joint states often show it before; new views are a little ahead of /clock then.
-        """
-        if self.session is None:
-            return
-        now = self.get_clock().now().nanoseconds
-        newest = max((view.stamp_ns for view in self.session.buffer.views()), default=0)
-        if newest > now + self.settings.core.buffer.clock_jump_s * 1e9:
-            text = "ROS time went back: the views of before are forgotten"
-            self.log.warning(text, cause="ROS time")
-            self.take_events(self.session.new_item("ROS time went back"))
+        """ROS time went back."""
+        if self.session is not None:
+            now = self.get_clock().now().nanoseconds
+            self.take_events(self.session.clock_set_back(now))
 
     # ---- flattening
 

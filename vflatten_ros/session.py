@@ -69,6 +69,10 @@ class Session:
         """Forget the present item."""
         return self._noted(self.buffer.new_item(cause))
 
+    def clock_set_back(self, to_ns: int) -> tuple[Event, ...]:
+        """Forget what is stamped later than the clock, which was set back."""
+        return self._noted(self.buffer.clock_set_back(to_ns))
+
     def _noted(self, events: tuple[Event, ...]) -> tuple[Event, ...]:
         if any(isinstance(event, ItemStarted) for event in events):
             self.pairs.clear()

@@ -276,6 +276,30 @@ def test_a_clock_that_goes_back_starts_over():
     assert (state.clock_jumps, state.stage, len(state.view_ids)) == (1, Stage.COMPLETE, 12)
 
 
+def test_a_clock_that_says_so_itself_starts_over_once():
+    buffer = make()
+    joints(buffer, 0, 20)
+    buffer.add_cloud(cloud(15 * S), 0)
+    assert buffer.clock_set_back(int(19.5 * S)) == ()
+    jumped, started = buffer.clock_set_back(5 * S)
+    assert (type(jumped), jumped.to_ns, started.item) == (ClockJumped, 5 * S, 2)
+    joints(buffer, 20, 20.2)  # were on their way
+    joints(buffer, 5, 7)
+    buffer.add_cloud(cloud(6 * S), 0)
+    state = check_accounts(buffer)
+    assert (state.item, state.clock_jumps, len(state.view_ids)) == (2, 1, 1)
+
+
+def test_joint_states_that_go_on_as_before_are_believed_in_the_end():
+    """The clock was set back, but not that of the joint states."""
+    buffer = make()
+    joints(buffer, 0, 20)
+    buffer.clock_set_back(5 * S)
+    joints(buffer, 20, 22, received=2 * S)
+    buffer.add_cloud(cloud(21 * S), 2 * S)
+    assert len(check_accounts(buffer).view_ids) == 1
+
+
 def test_a_cloud_that_shows_the_new_time_first_is_not_lost():
     buffer = make()
     joints(buffer, 100, 110)

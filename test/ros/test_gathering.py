@@ -168,6 +168,20 @@ def test_two_rigs_side_by_side_each_hear_their_own(ros, tmp_path):
             rig.close()
 
 
+def test_bag_time_that_begins_anew_begins_one_item(ros, tmp_path):
+    arguments = ["--calibration", str(CALIBRATION), "--ros-args", "-p", "use_sim_time:=true"]
+    rig = Rig(tmp_path, arguments=arguments)
+    try:
+        rig.set_parameter("auto_flatten", False)
+        rig.play("--rate", 6, "--loop", 2, "--clock")
+        buffer = rig.until(rig.complete, "the rotation")
+        assert buffer.item == 2
+        assert not buffer.drop_counts
+        assert rig.diagnostics()["buffer"]["clock jumps"] == "1"
+    finally:
+        rig.close()
+
+
 def test_planners_as_processes_at_once_each_get_a_result(rig, tmp_path):
     player = rig.play("--rate", 8, "--loop", wait=False)
     rig.until(lambda: len(rig.buffer().views) > 3, "some views")

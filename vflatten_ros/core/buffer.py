@@ -80,6 +80,7 @@ class ViewBuffer:
         self._clock_jumps = 0
         self._now_ns = 0
         self._suspect: tuple[int, float] | None = None
+        self._outdated: tuple[int, int] | None = None  # stamps from, received until
         self._begin_item()
 
     def configure(self, config: Config) -> None:
@@ -96,6 +97,8 @@ class ViewBuffer:
         """Take one joint state; states without the wrist joint count for the fingers only."""
         if len(self._joints_seen) < MOST_NAMES:
             self._joints_seen.update(names[:MOST_NAMES])
+        if self._on_its_way(stamp_ns, received_ns):
+            return self._settle(received_ns)
         values = dict(zip(names, positions, strict=False))
         events: list[Event] = []
         if self._calibration.joint in values:
@@ -146,6 +149,18 @@ class ViewBuffer:
     def new_item(self, cause: str = "requested") -> tuple[Event, ...]:
         """Forget the present item's views and counts."""
         return tuple(self._start_item(cause, None))
+
+    def clock_set_back(self, to_ns: int) -> tuple[Event, ...]:
+        """The clock reads `to_ns` again: forget what is stamped later, unless by a little only.
+
+        Where nobody says so, joint states show it.
+        """
+        newest = max(self._newest_ns or to_ns, self._track.newest_ns or to_ns)
+        if newest - to_ns <= self._config.buffer.clock_jump_s * 1e9:
+            return ()
+        wait_ns = int(self._config.joints.wait_s * 1e9)
+        self._outdated = ((newest + to_ns) // 2, self._now_ns + wait_ns)
+        return tuple(self._jump_back(newest, to_ns))
 
     def clear_views(self, view_ids: Iterable[int]) -> tuple[Event, ...]:
         """Remove some views; unknown ids are left out."""
@@ -211,6 +226,16 @@ class ViewBuffer:
         return CloudDropped(view_id, reason, text)
 
     # ---- joint states
+
+    def _on_its_way(self, stamp_ns: int, received_ns: int) -> bool:
+        """Whether a joint state was sent before the clock was set back, and came after."""
+        if self._outdated is None:
+            return False
+        from_ns, until_ns = self._outdated
+        if stamp_ns >= from_ns and received_ns < until_ns:
+            return True
+        self._outdated = None
+        return False
 
     def _add_wrist(self, stamp_ns: int, position: float) -> list[Event]:
         """One sample of the wrist; the clock was set back once two samples in a row say so."""

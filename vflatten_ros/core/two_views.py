@@ -66,6 +66,7 @@ LINES_PER_POINT = 1  # geodesic lines that start at a boundary point
 POINT_SIGMA_M = 0.002  # of a flattened point, whatever its stress
 MISFIT_M = 0.003  # of neighbours, beyond which they lose their say when unrolled
 SMALLEST = 0.05  # share of the main piece's samples that makes a piece worth placing
+MOSTLY_LOOSE = 0.55  # share of the samples outside the main piece beyond which sizes are a guess
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +200,7 @@ def _from_surfaces(pair: _Pair, config: Config, progress: Progress) -> Flattened
     )
     progress("outline", 0.0)
     outline = trace_outline(pieces[0].surface, POINT_SIGMA_M, _half_pixel(pair), config.contour)
-    notices = pair.notices + _creases(joint, pieces)
+    notices = pair.notices + creases(joint, pieces)
     return Flattened(
         pieces[0].points, pieces[0].start_uv, lines, outline, pair.used, notices, pieces
     )
@@ -382,12 +383,16 @@ def _dense(
     )
 
 
-def _creases(joint: Joint, pieces: tuple[FlatPiece, ...]) -> tuple[Notice, ...]:
+def creases(joint: Joint, pieces: tuple[FlatPiece, ...]) -> tuple[Notice, ...]:
+    """What lies loose beside the main piece, and whether that is too much to go by."""
     share = 1.0 - len(pieces[0].points.uv) / len(joint.piece)
     if share < 0.05:
         return ()
     text = f"{100 * share:.0f} % of what the views show is joined to the rest only behind creases"
-    return (Notice("hidden_crease", text),)
+    notice = Notice("hidden_crease", text)
+    if share < MOSTLY_LOOSE:
+        return (notice,)
+    return notice, Notice("untrusted", "most of what the views show has no certain place")
 
 
 # --- evidence 'boundary' ------------------------------------------------------------------------
@@ -442,12 +447,17 @@ def _paper_distances(
     )
     lines = geodesic_lines(observation.surface, points[i], points[j], config.geodesics, progress)
     ri, rj = ring_pairs(ring.loop)
-    length = np.r_[lines.length_m, np.linalg.norm(points[ri] - points[rj], axis=1)]
-    sigma = np.r_[lines.sigma_m + 0.001, np.full(len(ri), 0.002)]
-    bound = np.r_[lines.reason == BENT, np.zeros(len(ri), dtype=bool)]
-    if config.flattening.solver == "springs":
-        bound[:] = False  # the paper has equalities only
-    return lines, DistanceNetwork(np.r_[i, ri] + shift, np.r_[j, rj] + shift, length, sigma, bound)
+    bent = lines.reason == BENT
+    # lines over what was not observed measure nothing, and the paper's springs know no bounds
+    keep = ~lines.flagged | (bent & (config.flattening.solver != "springs"))
+    alone = ring.loop < 0  # points inside, which nothing else holds
+    alone[np.r_[i[keep], j[keep]]] = False
+    keep |= alone[i] | alone[j]
+    i, j = np.r_[i[keep], ri] + shift, np.r_[j[keep], rj] + shift
+    length = np.r_[lines.length_m[keep], np.linalg.norm(points[ri] - points[rj], axis=1)]
+    sigma = np.r_[lines.sigma_m[keep] + 0.001, np.full(len(ri), 0.002)]
+    bound = np.r_[bent[keep], np.zeros(len(ri), dtype=bool)]
+    return lines, DistanceNetwork(i, j, length, sigma, bound)
 
 
 def _on_unknowns(network: DistanceNetwork, unknown: Int) -> DistanceNetwork:

@@ -23,6 +23,7 @@ REACH = 16  # samples to each side
 DIRECTION_M = 0.015  # the direction is averaged over so much, standard deviation
 AGREE_M = 0.02  # windows are judged over so much, standard deviation
 CHUNK = 4000
+SIGMAS = 2.0  # of the noise by which a sample may lie off the way and still be of one surface
 
 
 def average_along_rulings(
@@ -48,7 +49,7 @@ def average_along_rulings(
     """
     usable = layers.valid & ~layers.bridged
     rows, cols = np.nonzero(usable)
-    direction = ruling_directions(fits, layers, cell_m)[rows, cols]
+    direction = ruling_directions(fits, variance, layers, cell_m)[rows, cols]
     estimates = np.empty((len(WINDOWS_M), len(rows), 6))
     spread = np.empty((len(WINDOWS_M), len(rows)))
     inflation = _correlated(width_m)
@@ -60,14 +61,18 @@ def average_along_rulings(
     return _blend(fits, variance, rows, cols, estimates, spread, cell_m)
 
 
-def ruling_directions(fits: Float, layers: Layers, cell_m: float) -> Float:
+def ruling_directions(fits: Float, variance: Float, layers: Layers, cell_m: float) -> Float:
     """(rows, cols, 2) unit grid direction of least curvature, averaged over the surroundings."""
     steepness = 1 + (fits[..., 1] ** 2 + fits[..., 2] ** 2) / cell_m**2
     bend = np.stack([2 * fits[..., 3], fits[..., 4], 2 * fits[..., 5]]) / steepness**1.5
-    bend[:, ~layers.valid | layers.bridged] = 0.0
+    usable = layers.valid & ~layers.bridged
+    bend[:, ~usable] = 0.0
+    # curvature is known worst at borders, where it counts least
+    typical = float(np.median(variance[usable]))
+    sure = np.minimum(typical / np.maximum(variance, 1e-18), 1.0) ** 4
     a, b, d = bend
     squared = [
-        gaussian_filter(m, DIRECTION_M / cell_m, mode="constant", truncate=2.5)
+        gaussian_filter(sure * m, DIRECTION_M / cell_m, mode="constant", truncate=2.5)
         for m in (a * a + b * b, (a + d) * b, b * b + d * d)
     ]
     angle = 0.5 * np.arctan2(2 * squared[1], squared[0] - squared[2])
@@ -103,7 +108,9 @@ def _windows(
             fit[:, 1:3] = slope
             step = rise * stride * side if k else 0.0
             # the way there is one surface as long as depth goes on as it began
-            free &= np.abs(fit[:, 0] - before - step) < 0.5 * (cell_m + np.abs(step))
+            doubt = own_variance + flat[1].take(at)
+            limit = 0.5 * (cell_m + np.abs(step)) + SIGMAS * np.sqrt(doubt)
+            free &= np.abs(fit[:, 0] - before - step) < limit
             free &= flat[2].take(at)
             before = fit[:, 0]
             weight = free * np.minimum(own_variance / np.maximum(flat[1].take(at), 1e-18), 4.0)

@@ -6,6 +6,8 @@ row**2, row * col and col**2, in grid steps from the place.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from scipy.ndimage import correlate1d
 from scipy.sparse import csr_matrix, identity, vstack
@@ -52,6 +54,30 @@ def moved_by(fit: Float, offset: Float) -> Float:
     return out
 
 
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Normal equations of Gaussian-weighted quadratics, in units of the weight's width."""
+
+    normal: Float  # (k, 6, 6)
+    right: Float  # (k, 6) of depth less `level`
+    place: tuple[Int, Int]  # rows and columns
+    level: float
+    width: float  # standard deviation of the weight, grid steps
+
+    def part(self, keep: Bool) -> Sums:
+        """Those of some of the places; `keep` is (k,)."""
+        rows, cols = self.place
+        place = (rows[keep], cols[keep])
+        return replace(self, normal=self.normal[keep], right=self.right[keep], place=place)
+
+    def solved(self) -> tuple[Float, Float]:
+        """(k, 6) fits in grid steps, (k,) variance of their depth over that of a measured one."""
+        fits, gain = _solve(self.normal, self.right)
+        fits /= self.width ** np.array([0, 1, 1, 2, 2, 2])
+        fits[:, 0] += self.level
+        return fits, gain
+
+
 def quadratic_image(depth: Float, seen: Bool, where: Bool, width: float) -> tuple[Float, Float]:
     """Gaussian-weighted quadratic of the depth image by separable sums.
 
@@ -71,25 +97,32 @@ def quadratic_image(depth: Float, seen: Bool, where: Bool, width: float) -> tupl
     gain : ndarray of shape (rows, cols)
         Variance of the fitted depth over that of a measured one.
     """
+    return image_of(quadratic_sums(depth, seen, where, width), seen.shape)
+
+
+def image_of(sums: Sums, shape: tuple[int, ...]) -> tuple[Float, Float]:
+    """The solved fits and their gain as images, zero elsewhere."""
+    fits, gain = np.zeros((*shape, 6)), np.zeros(shape)
+    fits[sums.place], gain[sums.place] = sums.solved()
+    return fits, gain
+
+
+def quadratic_sums(depth: Float, seen: Bool, where: Bool, width: float) -> Sums:
+    """Normal equations of `quadratic_image`."""
     reach = int(np.ceil(2.5 * width))
     t = np.arange(-reach, reach + 1) / width
     kernels = [np.exp(-t * t / 2) * t**a for a in range(5)]
     level = float(depth[seen].mean())
     mass = _moments(seen.astype(float), kernels, 4)
     lifted = _moments(np.where(seen, depth - level, 0.0), kernels, 2)
-    pick = np.nonzero(where)
-    normal = np.empty((len(pick[0]), 6, 6))
-    right = np.empty((len(pick[0]), 6))
+    rows, cols = np.nonzero(where)
+    normal = np.empty((len(rows), 6, 6))
+    right = np.empty((len(rows), 6))
     for i, (a, b) in enumerate(POWERS):
-        right[:, i] = lifted[a, b][pick]
+        right[:, i] = lifted[a, b][rows, cols]
         for j, (c, d) in enumerate(POWERS[: i + 1]):
-            normal[:, i, j] = normal[:, j, i] = mass[a + c, b + d][pick]
-    solved, variance = _solve(normal, right)
-    solved /= width ** np.array([0, 1, 1, 2, 2, 2])
-    solved[:, 0] += level
-    fits, gain = np.zeros((*seen.shape, 6)), np.zeros(seen.shape)
-    fits[pick], gain[pick] = solved, variance
-    return fits, gain
+            normal[:, i, j] = normal[:, j, i] = mass[a + c, b + d][rows, cols]
+    return Sums(normal, right, (rows, cols), level, width)
 
 
 def noise_inflation(residual: Float, seen: Bool, width: float) -> float:
@@ -217,7 +250,14 @@ def _solve(normal: Float, right: Float) -> tuple[Float, Float]:
 
 
 def tangent_fits(
-    rays: RayGrid, rc: Float, points: Float, window: Int, near: Bool, middle: Float, width_m: float
+    rays: RayGrid,
+    rc: Float,
+    points: Float,
+    clean: Float,
+    window: Int,
+    near: Bool,
+    middle: Float,
+    width_m: float,
 ) -> tuple[Float, Float, Bool]:
     """Quadratics in the local tangent frame, for steep places and beside jumps.
 
@@ -230,12 +270,16 @@ def tangent_fits(
         Grid places of the fits.
     points : ndarray of shape (3, all)
         Measured points.
+    clean : ndarray of shape (3, all)
+        The same, moved along their rays to where the surface is thought to be. They say where in
+        the tangent plane a point lies: by the measured places themselves noise would move points
+        within the plane too, and steep borders would come out too steep.
     window : ndarray of shape (n, k)
         Which of them are around each place.
     near : ndarray of shape (n, k)
         Which of those count.
     middle : ndarray of shape (3, k)
-        Measured point nearest to each place.
+        Clean point nearest to each place.
     width_m : float
         Standard deviation of the weight along the surface, metres.
 
@@ -243,13 +287,15 @@ def tangent_fits(
     -------
     fits (k, 6), gain (k,), good (k,)
     """
-    axes = _principal_axes(points, window, near, middle, 1.5 * width_m)
+    axes = _principal_axes(clean, window, near, middle, 1.5 * width_m)
     width = width_m * _widening(rays, rc, axes[2])
     normal = np.zeros((6, 6, len(rc)))
     right = np.zeros((6, len(rc)))
     for at, counts in zip(window, near):
+        away = (clean[:, at] - middle) / width
+        u, v = (a[0] * away[0] + a[1] * away[1] + a[2] * away[2] for a in axes[:2])
         away = (points[:, at] - middle) / width
-        u, v, w = (a[0] * away[0] + a[1] * away[1] + a[2] * away[2] for a in axes)
+        w = axes[2][0] * away[0] + axes[2][1] * away[1] + axes[2][2] * away[2]
         weight = np.exp(-0.5 * (u * u + v * v)) * counts
         basis = (weight, weight * u, weight * v, weight * u * u, weight * u * v, weight * v * v)
         plain = (1.0, u, v, u * u, u * v, v * v)

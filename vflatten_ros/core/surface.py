@@ -15,13 +15,15 @@ from vflatten_ros.core.config import SurfaceConfig
 from vflatten_ros.core.depth_image import depth_image
 from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.raygrid import RayGrid
+from vflatten_ros.core.refinement import settle_borders, sharpen_folds
 from vflatten_ros.core.rulings import average_along_rulings
 from vflatten_ros.core.smoothing import (
     fill_holes,
+    image_of,
     moved_by,
     noise_inflation,
     plane_fits,
-    quadratic_image,
+    quadratic_sums,
     slope_at,
     tangent_fits,
     value_at,
@@ -30,6 +32,7 @@ from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 from vflatten_ros.core.weighted_planes import linear_fit, view_frame
 
 CHUNK = 4000  # places fitted at a time, so that the arrays stay in the cache
+STEEP = 1.7  # grid steps deep for one across: 60 degrees from the view
 STEEPEST = 6.0  # grid steps deep for one across: 80 degrees from the view
 REACH = 5  # grid steps to each side in a fit in the tangent frame
 
@@ -93,7 +96,8 @@ def fit_surface(
     progress("surface", 0.2)
     cell = rays.spacing(float(np.median(image[seen])))
     width = max(config.radius_m / 1.75 / cell, 1.2)
-    fits, gain = quadratic_image(image, seen, near_measured(seen), width)
+    sums = quadratic_sums(image, seen, near_measured(seen), width)
+    fits, gain = image_of(sums, seen.shape)
     noise = 1.4826 * float(np.median(np.abs(image - fits[..., 0])[seen]))
     places = np.moveaxis(np.indices(seen.shape), 0, -1).astype(float)
     measured = rays.to_points(places, image)
@@ -101,15 +105,21 @@ def fit_surface(
     misfit = (image - fits[..., 0]) / steepness
     layers = find_layers(image, seen, measured, cell, noise, misfit)
     progress("surface", 0.5)
-    special = _special(layers, fits, cell, int(np.ceil(2 * width)))
+    cut = _beside_cuts(layers)
+    near_cut = maximum_filter(cut, 2 * int(np.ceil(2 * width)) + 1)
+    steep = np.hypot(fits[..., 1], fits[..., 2]) > STEEP * cell
+    special = layers.valid & ~layers.bridged & (near_cut | steep)
     if config.fit == "linear":
         fits = _linear_fits(points, toward, rays, layers, measured, fits, cell, config.radius_m)
     else:
-        _refit(rays, layers, measured, special, width * cell, fits, gain)
+        usable = layers.valid & ~layers.bridged
+        fits, gain = settle_borders(fits, gain, sums, usable & ~special, noise)
+        _refit(rays, layers, image, measured, special, width * cell, fits, gain, noise)
         _mend_cliffs(layers, fits, cell)
         variance = noise**2 * gain * noise_inflation(image - fits[..., 0], seen, width)
         if config.along_rulings:
             fits, variance = average_along_rulings(fits, variance, layers, cell, width * cell)
+        fits = sharpen_folds(fits, variance, usable, special | near_cut, width)
         gain = variance / max(noise, 1e-12) ** 2
     fits = fill_holes(fits, layers.valid & ~layers.bridged, layers.bridged)
     progress("surface", 0.9)
@@ -135,13 +145,12 @@ def _assemble(
     )  # fmt: skip
 
 
-def _special(layers: Layers, fits: Float, cell: float, reach: int) -> Bool:
-    """Places near a jump or steeper than 60 degrees."""
+def _beside_cuts(layers: Layers) -> Bool:
+    """Places from which a jump parts the next."""
     cut = np.zeros(layers.valid.shape, bool)
     cut[:, :-1] |= layers.valid[:, :-1] & layers.valid[:, 1:] & ~layers.smooth_right[:, :-1]
     cut[:-1] |= layers.valid[:-1] & layers.valid[1:] & ~layers.smooth_down[:-1]
-    steep = np.hypot(fits[..., 1], fits[..., 2]) > 1.7 * cell
-    return np.asarray(layers.valid & ~layers.bridged & (maximum_filter(cut, 2 * reach + 1) | steep))
+    return cut
 
 
 def _mend_cliffs(layers: Layers, fits: Float, cell: float) -> None:
@@ -173,17 +182,21 @@ def _mend_cliffs(layers: Layers, fits: Float, cell: float) -> None:
 def _refit(
     rays: RayGrid,
     layers: Layers,
+    image: Float,
     measured: Float,
     special: Bool,
     width_m: float,
     fits: Float,
     gain: Float,
+    noise_m: float,
 ) -> None:
     """Replace fits and gain at special places by fits in the local tangent frame."""
     rows, cols = np.nonzero(special)
     wide = special.shape[1] + 2 * REACH
     pad = ((REACH, REACH), (REACH, REACH))
     points = np.pad(measured, (*pad, (0, 0))).reshape(-1, 3).T.copy()
+    moved = _onto_fits(rays, layers.seen, image, measured, fits, noise_m)
+    clean = np.pad(moved, (*pad, (0, 0))).reshape(-1, 3).T.copy()
     seen = np.pad(layers.seen, pad).ravel()
     span = np.arange(-REACH, REACH + 1)
     offsets = (span[:, None] * wide + span).reshape(-1, 1)
@@ -191,11 +204,20 @@ def _refit(
         r, c = rows[k : k + CHUNK], cols[k : k + CHUNK]
         window = offsets + (r + REACH) * wide + c + REACH
         near = connected_window(layers, r, c, REACH).reshape(window.shape) & seen[window]
-        source = measured.reshape(-1, 3)[layers.source[r, c]].T
+        source = moved.reshape(-1, 3)[layers.source[r, c]].T
         rc = np.stack([r, c], axis=1).astype(float)
-        fit, variance, good = tangent_fits(rays, rc, points, window, near, source, width_m)
+        fit, variance, good = tangent_fits(rays, rc, points, clean, window, near, source, width_m)
         fits[r[good], c[good]] = fit[good]
         gain[r[good], c[good]] = variance[good]
+
+
+def _onto_fits(
+    rays: RayGrid, seen: Bool, image: Float, measured: Float, fits: Float, noise_m: float
+) -> Float:
+    """Measured points moved along their rays onto the fits, where these are not far."""
+    places = np.moveaxis(np.indices(seen.shape), 0, -1).astype(float)
+    close = seen & (np.abs(image - fits[..., 0]) < 4 * noise_m)
+    return np.where(close[..., None], rays.to_points(places, fits[..., 0]), measured)
 
 
 def _linear_fits(

@@ -19,10 +19,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from vflatten_ros.core.surface import Surface
+from vflatten_ros.core.unrolling import arcs
 from vflatten_ros.core.values import Bool, Float, Int
 
 Complex = NDArray[np.complex128]
-ROUNDS = 4
+ROUNDS = 8
 GAP = 6  # grid steps across the widest gap that is tied
 MOST_MISFIT_M = 0.003  # a tie that misses the way around by more is none: a cut, or another layer
 
@@ -119,17 +120,11 @@ def _frames(surface: Surface, rows: Int, cols: Int) -> tuple[Float, Float]:
 
 def _steps(points: Float, frames: Float, a: Int, b: Int) -> _Steps:
     """The step along each edge as a complex number in the frames of both ends."""
-    chord = points[b] - points[a]
-    length = np.linalg.norm(chord, axis=1)
-    cosine = np.einsum("ki,ki->k", frames[a, 2], frames[b, 2])
-    # the surface turns by this angle along the edge: its arc is longer than the chord
-    half = 0.5 * np.arccos(np.clip(cosine, 0.0, 1.0))
-    length *= 1 + half**2 / 6
+    ahead = arcs(points[b] - points[a], frames[a, 2], frames[b, 2])
     steps = []
-    for end in (a, b):
-        x, y = (np.einsum("ki,ki->k", frames[end, i], chord) for i in (0, 1))
-        flat = x + 1j * y
-        steps.append(flat * (length / np.maximum(np.abs(flat), 1e-15)))
+    for end, step in zip((a, b), ahead):
+        x, y = (np.einsum("ki,ki->k", frames[end, i], step) for i in (0, 1))
+        steps.append(x + 1j * y)
     return _Steps(a, b, steps[0], steps[1])
 
 
@@ -140,8 +135,12 @@ def _solve(steps: _Steps, sure: Float, count: int) -> tuple[Complex, Float]:
     factor, incidence = _factor(count, a, b, weight)
     turn = factor.solve(incidence.T @ (weight * np.angle(steps.of_a * steps.of_b.conj())))
     place = _place(factor, incidence, weight * steps.turned(turn))
-    for _ in range(ROUNDS):
-        turn = _turns(place, steps, weight, turn)
+    before = turn
+    for k in range(ROUNDS):
+        turned = _turns(place, steps, weight, turn)
+        # momentum (Nesterov 1983): bends of the whole patch die out slowly without
+        change = k / (k + 3) * np.angle(np.exp(1j * (turned - before)))
+        turn, before = turned + change, turned
         place = _place(factor, incidence, weight * steps.turned(turn))
     return place, turn
 

@@ -67,16 +67,7 @@ def relate(points: Float, normals: Float, i: Int, j: Int) -> Relations:
         Pairs.
     """
     right, up = tangent_frames(normals)
-    chord = points[j] - points[i]
-    middle = normals[i] + normals[j]
-    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    flat = chord - _dot(chord, middle)[:, None] * middle
-    bend = normals[j] - normals[i]
-    size = np.linalg.norm(bend, axis=1)
-    across = bend / np.maximum(size, 1e-12)[:, None]  # the direction that bends
-    half = np.arcsin(np.clip(size / 2.0, 0.0, 1.0))
-    arc = np.where(half > 1e-4, half / np.maximum(np.sin(half), 1e-9), 1.0)
-    along = flat + ((arc - 1.0) * _dot(flat, across))[:, None] * across
+    ahead, back = arcs(points[j] - points[i], normals[i], normals[j])
 
     def in_frame(vector: Float, of: Int) -> Complex:
         return _dot(vector, right[of]) + 1j * _dot(vector, up[of])
@@ -85,10 +76,37 @@ def relate(points: Float, normals: Float, i: Int, j: Int) -> Relations:
     return Relations(
         i,
         j,
-        in_frame(_carried(along, middle, normals[i]), i),
-        in_frame(_carried(-along, middle, normals[j]), j),
+        in_frame(ahead, i),
+        in_frame(-back, j),
         turn / np.abs(turn),
     )
+
+
+def arcs(chord: Float, start: Float, end: Float) -> tuple[Float, Float]:
+    """Steps along the surface of given chords, in the tangent planes at both of their ends.
+
+    Exact on cylinders, whatever the direction of the chord.
+
+    Parameters
+    ----------
+    chord : ndarray of shape (m, 3)
+    start, end : ndarray of shape (m, 3)
+        Unit normals at the two ends of each.
+
+    Returns
+    -------
+    at_start, at_end : ndarray of shape (m, 3)
+    """
+    middle = start + end
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    flat = chord - _dot(chord, middle)[:, None] * middle
+    bend = end - start
+    size = np.linalg.norm(bend, axis=1)
+    across = bend / np.maximum(size, 1e-12)[:, None]  # the direction that bends
+    half = np.arcsin(np.clip(size / 2.0, 0.0, 1.0))
+    arc = np.where(half > 1e-4, half / np.maximum(np.sin(half), 1e-9), 1.0)
+    along = flat + ((arc - 1.0) * _dot(flat, across))[:, None] * across
+    return _carried(along, middle, start), _carried(along, middle, end)
 
 
 def tangent_frames(normals: Float) -> tuple[Float, Float]:

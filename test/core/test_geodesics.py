@@ -139,6 +139,24 @@ def test_a_line_across_a_raised_flap_says_so():
     assert (lines.reason == JUMP).all()
 
 
+def test_the_deviation_of_lines_over_a_low_step_covers_what_it_hides():
+    patch, on_flap = synthetic.flap(0.0075)
+    x = patch.flat[:, 0]
+    a, b, exact = patch.pairs(100, among=x < -0.06, to=on_flap)
+    lines = lines_of(patch, (a, b), 0.001)
+    assert (lines.reason == JUMP).mean() > 0.95
+    assert (np.abs(lines.length_m - exact) < 2 * lines.sigma_m).mean() > 0.9
+
+
+def test_every_line_across_a_narrow_slit_says_so():
+    patch = synthetic.curtain(0.020, hidden=synthetic.slit)
+    u, v = patch.flat.T
+    a, b, _ = patch.pairs(
+        100, among=(u > 0) & (v > -0.01), to=(u > 0) & (v < -0.03), straight=False
+    )
+    assert lines_of(patch, (a, b), 0.001).flagged.all()
+
+
 def test_a_line_beside_a_flap_is_right():
     patch, _ = synthetic.flap()
     x = patch.flat[:, 0]

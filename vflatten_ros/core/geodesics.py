@@ -9,18 +9,19 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from vflatten_ros.core.arrays import as_points
-from vflatten_ros.core.breaks import joined_places
+from vflatten_ros.core.breaks import Layers, connected_window, joined_places
 from vflatten_ros.core.config import GeodesicConfig
 from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.routes import find_routes
 from vflatten_ros.core.springs import relax_springs
 from vflatten_ros.core.surface import Surface, depth_at
-from vflatten_ros.core.values import Bool, Float, Progress, no_progress
+from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 OK, JUMP, MISSING, BENT, NOT_CONVERGED = range(5)
 REASONS = ("ok", "jump", "missing data", "bent", "not converged")
 STEPS = 20  # of Gauss-Newton; lines on cloth need 3 to 8
 FINE = 4  # samples a node interval when a line is measured
+CORNER = 2  # grid steps past the corner of a rim
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,10 +251,27 @@ def _gaps(
     # on a guessed surface without a break the way along it beats the chord
     smooth = ~broken.any(axis=1)
     bridge = np.where(smooth, gap, chord)
+    brief = ~smooth & (gap < 1.5 * surface.spacing_m) & (bridge > 0)
+    gap[brief] *= ~_beside(layers, place[row, first][brief], place[row, last][brief])
     depth = surface.rays.to_grid(points)[1]
     step = np.abs(np.diff(depth, axis=1)).max(axis=1)
-    jumps = broken.any(axis=1) & (step > 3.0 * surface.spacing_m)
+    measured, level = joined_places(layers, tight, over_gaps=True)
+    cut = (measured[:, :-1] & measured[:, 1:] & ~level).any(axis=1)
+    jumps = cut | broken.any(axis=1) & (step > 3.0 * surface.spacing_m)
     return gap, np.where(gap > 0, bridge, 0.0), jumps
+
+
+def _beside(layers: Layers, a: Int, b: Int) -> Bool:
+    """(k,) whether places (k, 2) at most two steps apart are joined by those around them.
+
+    A line along a rim then only cuts a corner of it, by less than a grid step.
+    """
+    way = b - a
+    near = np.abs(way).max(axis=1) <= CORNER
+    strict = replace(layers, smooth_right=layers.right, smooth_down=layers.down)
+    window = connected_window(strict, a[:, 0], a[:, 1], CORNER)
+    at = np.clip(way + CORNER, 0, 2 * CORNER)
+    return np.asarray(near & window[at[:, 0], at[:, 1], np.arange(len(a))])
 
 
 def _end_sigma(surface: Surface, dense: Float, points: Float) -> Float:

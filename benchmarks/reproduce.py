@@ -277,8 +277,8 @@ def times(rows: list[Row]) -> str:
         "",
         "From opening the recording to the measured item, without the start of the program and the "
         f"figures; the fastest of {RUNS} runs on the machine that wrote this page. All clouds of "
-        "the recording are read and segmented (views), two are used. Where other programs share the "
-        "machine, the CPU seconds tell more. The paper gives no times.",
+        "the recording are read and segmented (views), two are used. Where other programs share "
+        "the machine, the CPU seconds tell more. The paper gives no times.",
         "",
     ]
     return "\n".join(lines)

@@ -6,11 +6,14 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 
 import garments
 
-GOOD, SLOW, STUBBORN, CRASH, WRONG, MISTAKE = 30, 31, 32, 33, 34, 35
+from vflatten_ros.worker import STOP
+
+GOOD, SLOW, STUBBORN, CRASH, WRONG, MISTAKE, SILENT = 30, 31, 32, 33, 34, 35, 36
 
 
 def load():
@@ -41,8 +44,11 @@ def example_or_trouble(what, progress):
     from vflatten_ros.core.errors import NotEnoughViews
 
     progress("work", 0.0)
-    if what == STUBBORN:
+    if what == SILENT:
         time.sleep(30.0)  # without a word
+    if what == STUBBORN:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {STOP})  # as a long computation in C
+        time.sleep(30.0)
     if what == CRASH:
         os._exit(7)
     if what == WRONG:

@@ -144,9 +144,10 @@ def test_errors_of_the_method_are_told_and_the_next_task_goes_on(office):
     assert office.answer(office.ask(slow_work.GOOD)).garment
 
 
-def test_a_cancelled_task_stops_and_the_process_stays(office):
-    asker = office.ask(slow_work.SLOW)
-    office.until(lambda: asker.steps)
+@pytest.mark.parametrize("work", [slow_work.SLOW, slow_work.SILENT])
+def test_a_cancelled_task_stops_and_the_process_stays(office, work):
+    asker = office.ask(work)
+    office.until(lambda: ("work", 0.0) in asker.steps)
     restarts = office.goals.restarts
     office.goals.withdraw(asker.listener)
     began = time.monotonic()

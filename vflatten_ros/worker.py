@@ -27,6 +27,9 @@ from vflatten_ros.core.errors import Cancelled, VFlattenError
 from vflatten_ros.core.values import Correspondence, FlatGarment, Progress, View
 
 PROGRESS_PERIOD_S = 0.05
+STOP = (
+    signal.SIGUSR1
+)  # from the process to itself: the main thread looks whether its job is cancelled
 
 
 @dataclass(frozen=True)
@@ -209,6 +212,7 @@ def serve(pipe: Connection, load: Load, nice: int) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.nice(nice)
     inbox = _Inbox(pipe)
+    signal.signal(STOP, lambda number, frame: inbox.stop_if_cancelled())
     threading.Thread(target=inbox.receive, daemon=True).start()
     work = load()
     pipe.send(Ready())
@@ -225,10 +229,24 @@ class _Inbox:
 
     def __init__(self, pipe: Connection) -> None:
         self.cancelled: set[int] = set()
+        self.running: int | None = None  # number of the job that may be stopped wherever it is
         self._pipe = pipe
         self._views: dict[int, View] = {}
         self._tasks: queue.PriorityQueue[tuple[int, int, _Task]] = queue.PriorityQueue()
         self._numbers = itertools.count()
+
+    def stop_if_cancelled(self) -> None:
+        """Raises Cancelled in the middle of a cancelled job."""
+        if self.running in self.cancelled:
+            raise Cancelled("the caller asked to stop")
+
+    @contextlib.contextmanager
+    def sending(self) -> Iterator[None]:
+        """While a job sends: half a message would spoil the pipe."""
+        running, self.running = self.running, None
+        yield
+        self.running = running
+        self.stop_if_cancelled()  # a request that came meanwhile
 
     def next_task(self) -> _Task:
         """Wait for something to do: jobs first, then views to prepare."""
@@ -253,6 +271,7 @@ class _Inbox:
                 self._views.pop(rest[0], None)
             elif kind == "cancel":
                 self.cancelled.add(rest[0])
+                signal.pthread_kill(_main_thread(), STOP)
             else:
                 views = [self._views[key] for key in rest[0].view_keys]
                 self._put(_JOB, partial(self._do, rest[0], views))
@@ -267,7 +286,14 @@ class _Inbox:
                 work.prepare(view, config)
 
     def _do(self, job: Job, views: list[View], work: Work) -> None:
-        self._pipe.send(_outcome(work, job, views, _Reporter(self._pipe, job, self)))
+        try:
+            self.running = job.number
+            outcome = _outcome(work, job, views, _Reporter(self._pipe, job, self))
+            self.running = None
+        except Cancelled as error:  # just as it ended
+            self.running = None
+            outcome = Outcome(job.number, error=str(error), cancelled=True)
+        self._pipe.send(outcome)
 
 
 class _Reporter:
@@ -279,20 +305,26 @@ class _Reporter:
         self.seconds: dict[str, float] = {}
 
     def __call__(self, stage: str, fraction: float) -> None:
-        if self._number in self._inbox.cancelled:
-            raise Cancelled("the caller asked to stop")
+        self._inbox.stop_if_cancelled()
         now = time.perf_counter()
         if stage != self._stage:
             self.close(now)
             self._stage, self._reported = stage, 0.0
         if now - self._reported >= PROGRESS_PERIOD_S:
             self._reported = now
-            self._pipe.send(Step(self._number, stage, fraction))
+            with self._inbox.sending():
+                self._pipe.send(Step(self._number, stage, fraction))
 
     def close(self, now: float) -> None:
         if self._stage:
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
         self._since = now
+
+
+def _main_thread() -> int:
+    ident = threading.main_thread().ident
+    assert ident is not None
+    return ident
 
 
 def _outcome(work: Work, job: Job, views: list[View], report: _Reporter) -> Outcome:

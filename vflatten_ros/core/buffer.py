@@ -59,6 +59,7 @@ __all__ = [
 ]
 
 MOST_NAMES = 256  # joints remembered by name
+ON_ITS_WAY_NS = 300_000_000  # longest from a joint state's publication to its arrival
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +159,7 @@ class ViewBuffer:
         newest = max(self._newest_ns or to_ns, self._track.newest_ns or to_ns)
         if newest - to_ns <= self._config.buffer.clock_jump_s * 1e9:
             return ()
-        wait_ns = int(self._config.joints.wait_s * 1e9)
-        self._outdated = ((newest + to_ns) // 2, self._now_ns + wait_ns)
+        self._outdated = ((newest + to_ns) // 2, self._now_ns + ON_ITS_WAY_NS)
         return tuple(self._jump_back(newest, to_ns))
 
     def clear_views(self, view_ids: Iterable[int]) -> tuple[Event, ...]:

@@ -45,7 +45,7 @@ ITEMS = {
     "TR1": "trousers",
     "TR2": "trousers",
 }
-RUNS = 3  # of every item, for its time
+RUNS = 2  # of every item, for its time
 ROWS = {"LS": "long_sleeve_shirt", "TR": "trousers"}
 
 # Kita & Kita 2019, Table 1 (R) and Table 2 (result and ground truth, cm)

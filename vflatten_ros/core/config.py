@@ -333,7 +333,7 @@ class AssemblyConfig(Checked):
         0.004, "Pieces may overlap by so much in the plane, m.", low=0.0, high=0.1
     )
     hinge_m: float = option(
-        0.012,
+        0.01,
         "How far from there the pieces may meet in the plane, one sigma, m.",
         low=0.001,
         high=0.5,

@@ -21,7 +21,7 @@ OK, JUMP, MISSING, BENT, NOT_CONVERGED = range(5)
 REASONS = ("ok", "jump", "missing data", "bent", "not converged")
 STEPS = 20  # of Gauss-Newton; lines on cloth need 3 to 8
 FINE = 4  # samples a node interval when a line is measured
-CORNER = 2  # grid steps past the corner of a rim
+CORNER = 1  # grid steps past the corner of a rim
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +251,7 @@ def _gaps(
     # on a guessed surface without a break the way along it beats the chord
     smooth = ~broken.any(axis=1)
     bridge = np.where(smooth, gap, chord)
-    brief = ~smooth & (gap < 1.5 * surface.spacing_m) & (bridge > 0)
+    brief = ~smooth & (gap < surface.spacing_m) & (bridge > 0)
     gap[brief] *= ~_beside(layers, place[row, first][brief], place[row, last][brief])
     depth = surface.rays.to_grid(points)[1]
     step = np.abs(np.diff(depth, axis=1)).max(axis=1)

@@ -11,7 +11,7 @@ from vflatten_ros.core.one_view import flatten_one_view
 from vflatten_ros.core.values import View
 
 
-def seen_by_camera(rows=480, cols=360, focal=520.0):
+def seen_by_camera(rows=480, cols=360, focal=520.0, width_m=WIDTH_M):
     """The towel of garments.py, exactly where the camera's rays meet it, and its flat places."""
     # rays against the cylinder x^2 + y^2 = r^2 in the hanger frame at item angle 0
     T_rig_hanger = CALIBRATION.T_rig_hanger(0.0)
@@ -25,7 +25,7 @@ def seen_by_camera(rows=480, cols=360, focal=520.0):
     depth = (-b[met] - np.sqrt(root[met])) / a[met]
     at = eye + depth[:, None] * way[met]
     u, v = RADIUS_M * np.arctan2(at[:, 1], at[:, 0]), at[:, 2] + BELOW_TIP_M
-    inside = (np.abs(u) < WIDTH_M / 2) & (v < 0) & (v > -HEIGHT_M)
+    inside = (np.abs(u) < width_m / 2) & (v < 0) & (v > -HEIGHT_M)
     pixel = np.c_[row[met], col[met]][inside].astype(np.int32)
     points = transform_points(T_rig_hanger, at[inside])
     flat = np.c_[u, v][inside]
@@ -48,6 +48,17 @@ def test_a_bent_sheet_comes_out_as_its_rectangle():
     assert set(done.points.view_id.tolist()) == {3}
     assert len(done.lines.length_m) > 10
     assert done.notices == ()
+
+
+def test_where_it_folds_away_only_what_is_seen_ends():
+    view, _ = seen_by_camera(width_m=2.0 * np.pi * RADIUS_M)
+    outline = flatten_one_view(view, Config()).outline
+    low, high = outline.uv.min(axis=0), outline.uv.max(axis=0)
+    inner = outline.uv[:, 1] > low[1] + 0.03, outline.uv[:, 1] < high[1] - 0.03
+    side = inner[0] & inner[1]
+    middle = np.abs(outline.uv[:, 0] - 0.5 * (low + high)[0]) < 0.25 * (high - low)[0]
+    assert outline.inferred[side].mean() > 0.95
+    assert outline.inferred[middle].mean() < 0.05  # the hems
 
 
 def test_it_lies_as_it_hangs():

@@ -14,6 +14,8 @@ from vflatten_ros.core.surface import Surface, fit_surface
 from vflatten_ros.core.values import Bool, Float, Int, Progress, View
 
 GRAZING = 0.25  # cosine of the angle between ray and normal beyond which the cloth turns away
+TURNING_M = 0.012  # across the view, within which cloth that curves away would turn its back
+TURNING_PX = 6  # reach of the fit that foretells it
 PARALLEL_M = 1e3  # depth of parallel rays is counted from so far away, that its inverse is linear
 
 
@@ -29,6 +31,7 @@ class Observation:
     depth: Float  # (n,) along the rays, m
     facing: Float  # (n,) cosine of the angle between the normal and the direction to the camera
     ends: Int  # (e, 2) points at an end of what is seen; the next point beyond, -1: none near
+    turning: Bool  # (e,) there the cloth curves away from the camera: it goes on behind
 
 
 def observe(view: View, config: Config, progress: Progress) -> Observation:
@@ -46,9 +49,57 @@ def observe(view: View, config: Config, progress: Progress) -> Observation:
     cell = cell.reshape(-1)
     facing = np.einsum("ij,ij->i", surface.normals, toward)
     ends = np.where(found.ends >= 0, first[found.ends], -1)
+    fringe = found.fringe[cell]
+    turning = turns_away(place, facing, fringe, ends[:, 0], TURNING_M / surface.spacing_m)
     return Observation(
-        view, surface, place, found.patch[cell], found.fringe[cell], depth, facing, ends
+        view, surface, place, found.patch[cell], fringe, depth, facing, ends, turning
     )
+
+
+def turns_away(place: Int, facing: Float, patch: Int, at: Int, within_px: float) -> Bool:
+    """Where the cloth, as it curves, would turn its back just beyond the points: no end of it.
+
+    At the silhouette of a round fold the facing squared falls linearly to zero across the image. At
+    a hem the cloth ends as it faces. The fall is fitted over the same patch around each point.
+
+    Parameters
+    ----------
+    place : ndarray of shape (n, 2)
+        Row and column of every point.
+    facing : ndarray of shape (n,)
+        Cosine of the angle between the normal and the direction to the camera.
+    patch : ndarray of shape (n,)
+        Patch of every point, -1: none.
+    at : ndarray of shape (e,)
+        Points at an end of what is seen.
+    within_px : float
+        The cloth must turn its back this near, rows or columns.
+
+    Returns
+    -------
+    ndarray of shape (e,)
+    """
+    point, inverse = np.unique(at, return_inverse=True)
+    reach = TURNING_PX
+    grid = np.full(np.ptp(place, axis=0) + 2 * reach + 1, -1, dtype=np.int64)
+    own = place - place.min(axis=0) + reach
+    grid[tuple(own.T)] = np.arange(len(place))
+    step = np.argwhere(np.ones((2 * reach + 1, 2 * reach + 1))) - reach
+    step = step[(step**2).sum(axis=1) <= reach**2]
+    around = own[point][:, None] + step
+    near = grid[around[..., 0], around[..., 1]]
+    same = (near >= 0) & (patch[near] == patch[point, None]) & (patch[point, None] >= 0)
+    value = np.where(same, np.clip(facing[near], 0.0, 1.0) ** 2, 0.0)
+    design = np.column_stack([np.ones(len(step)), step])
+    normal = np.einsum("ks,si,sj->kij", same.astype(float), design, design)
+    plane = np.linalg.solve(normal + 1e-6 * np.eye(3), (value @ design)[..., None])[..., 0]
+    outward = -(same @ step).astype(float)
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    fall = -(plane[:, 1:] * outward).sum(axis=1)
+    enough = same.sum(axis=1) >= 2 * reach
+    turning = enough & (fall > 0.0) & (plane[:, 0] < within_px * fall)
+    result: Bool = turning[inverse.reshape(-1)]
+    return result
 
 
 def edges(observation: Observation, uv: Float, step_m: float) -> Bool:
@@ -57,7 +108,7 @@ def edges(observation: Observation, uv: Float, step_m: float) -> Bool:
     At an end of what is seen, the next cloth in the image tells: if it lies as far away in the
     plane as in space, it is the far side of a hole in the data; if it is as near to the camera or
     nearer, and lies elsewhere in the plane, it hides how the cloth goes on; otherwise the item
-    may end there. Cloth that turns away from the camera goes on, too.
+    may end there. Cloth that turns away from the camera, or is about to, goes on, too.
 
     Parameters
     ----------
@@ -72,7 +123,7 @@ def edges(observation: Observation, uv: Float, step_m: float) -> Bool:
     space = np.linalg.norm(points[i] - points[j], axis=1)
     flat = np.linalg.norm(uv[i] - uv[j], axis=1)
     hole = (j >= 0) & (flat < 1.5 * space + 0.004)  # False where either is nan
-    before = (j >= 0) & ~hole & (depth[j] < depth[i] + step_m)
+    before = ((j >= 0) & ~hole & (depth[j] < depth[i] + step_m)) | (~hole & observation.turning)
     balance = np.zeros(observation.place.max(axis=0) + 1)
     np.add.at(
         balance, tuple(observation.place[i].T), np.where(hole, 0.0, np.where(before, 1.0, -1.0))

@@ -52,7 +52,7 @@ def measure(
         notice = Notice("untrusted", "no category fits the item; sizes are not given")
         return Measured((), (), 0.0, 0.0, (notice,))
     if len(np.unique(points.view_id[points.view_id >= 0])) <= FEW:
-        fit = replace(fit, covariance=config.few_views_factor**2 * fit.covariance)
+        fit = replace(fit, covariance=_loosened(fit.covariance, config.few_views_factor))
     measurements = sizes(fit, config)
     coverage = covered(fit, points)
     quality = _quality(recognition, fit, measurements, coverage)
@@ -63,6 +63,15 @@ def measure(
         quality=quality,
         notices=_notices(recognition, measurements, coverage, quality, config),
     )
+
+
+def _loosened(covariance: Float, factor: float) -> Float:
+    """What was seen is less certain by a factor; what is usual of a category stays as it was."""
+    usual = np.diag(np.r_[0.0, 0.0, 0.0, np.ones(len(covariance) - 3)])
+    result: Float = np.linalg.inv(
+        np.linalg.inv(covariance) / factor**2 + (1.0 - 1.0 / factor**2) * usual
+    )
+    return result
 
 
 def sizes(fit: Fit, config: MeasurementConfig) -> tuple[Measurement, ...]:

@@ -12,7 +12,9 @@ from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.evidence import Evidence, evidence_from, look_up
 from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.template_fit import (
+    ALONG,
     Fit,
+    information,
     linearise,
     outline_residuals,
     place,
@@ -130,11 +132,9 @@ def _coarse(
 
 def finish(template: Template, evidence: Evidence, pose: Float, state: Float) -> Fit:
     """The fit under the errors that were found, and how well it explains what was seen."""
-    prior = np.diag(np.r_[1e-6, 1e-6, 1e-6, np.ones(template.dimensions)])
     scale = _spread(evidence, template, pose[0], state[0])
     pose, state, _ = refine(template, evidence, pose, state, LAST, scale)
     system = linearise(template, evidence, pose, state, scale * LAST[-1])
-    hessian = system.hessian[0] / scale**2 + prior
     energy = float(system.energy[0]) / scale**2 + 2.0 * evidence.total * np.log(scale)
     freedom = _freedom(template, state[0], system.hessian[0] / scale**2)
     outline = place(template, pose[0], state[0])[0][: template.vertices]
@@ -146,13 +146,23 @@ def finish(template: Template, evidence: Evidence, pose: Float, state: Float) ->
         template=template,
         pose=pose[0],
         state=state[0],
-        covariance=np.linalg.inv(hessian),
+        covariance=_covariance(template, evidence, pose[0], state[0], scale),
         evidence=-energy - freedom,
         misfit=energy / max(2.0 * evidence.total, 1e-9),
         residual_m=scale * float(np.median(evidence.sigma)),
         explained=float((residual < 3.0).mean()) if trusted.any() else 0.0,
         edge_seen=(on & (seen > 0)).astype(float),
     )
+
+
+def _covariance(
+    template: Template, evidence: Evidence, pose: Float, state: Float, scale: float
+) -> Float:
+    """Of pose and state; where no seen edge tells of a size, it is as uncertain as before."""
+    prior = np.diag(np.r_[1e-6, 1e-6, 1e-6, np.ones(template.dimensions)])
+    told = information(template, evidence, pose, state, scale * LAST[-1])
+    result: Float = np.linalg.inv(told / scale**2 + prior)
+    return result
 
 
 def _freedom(template: Template, state: Float, hessian: Float) -> float:
@@ -183,11 +193,19 @@ def _spread(evidence: Evidence, template: Template, pose: Float, state: Float) -
 
 
 def _edge_distances(evidence: Evidence, outline: Float) -> tuple[Float, Float]:
+    """Distance of samples of a template's edges from the seen outline; 1: it was seen, along them.
+
+    An outline across an edge, as that of a strip of cloth that reaches beyond it, does not show it.
+    """
     samples = samples_per_edge(len(outline))
     share: Float = ((np.arange(samples) + 0.5) / samples)[:, None]
     at = outline[:, None] * (1 - share) + np.roll(outline, -1, axis=0)[:, None] * share
-    distance, _, seen = look_up(evidence, at)
-    return distance, seen
+    distance, slope, seen = look_up(evidence, at)
+    step = np.roll(outline, -1, axis=0) - outline
+    outward = np.column_stack([step[:, 1], -step[:, 0]])
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    faces = (slope * outward[:, None]).sum(axis=-1) > ALONG
+    return distance, seen * faces
 
 
 def _probabilities(

@@ -21,6 +21,7 @@ MISSING = 0.8  # where residuals level off, in cuts: cloth that is missing is ea
 OUTSIDE = 1.5  # cloth that is too much is not
 WIDE = np.radians(20.0)  # parts that swing farther start spread, too
 SPREADS = np.radians([35.0, 75.0])
+ALONG = 0.5  # cosine between directions outward of an edge and of the outline that shows it
 FACING_M = 0.03  # how much farther an edge counts that faces across
 
 
@@ -120,6 +121,49 @@ def linearise(
     return _System(
         np.swapaxes(weighted, 1, 2) @ rows, (weighted * residual[..., None]).sum(axis=1), energy
     )
+
+
+def information(
+    template: Template, evidence: Evidence, pose: Float, state: Float, cut: float
+) -> Float:
+    """What the seen outline tells of one pose (3,) and state (m,), without the prior.
+
+    Unlike the normal equations of a fit, it is only what lies on the template, along its edges:
+    where the seen outline leaves the template, as where cloth folds away, it draws a fit but tells
+    nothing of where the edge is.
+
+    Returns
+    -------
+    ndarray of shape (3 + m, 3 + m)
+    """
+    points, slope = place(template, pose[None], state[None])
+    k = template.vertices
+    outline, moves = points[:, :k], slope[:, :k]
+    step = np.roll(outline[0], -1, axis=0) - outline[0]
+    outward = np.column_stack([step[:, 1], -step[:, 0]])
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    edge, along, distance, _ = _nearest_edge(evidence.outline, evidence.normal, outline)
+    facing = (evidence.normal * outward[edge[0]]).sum(axis=1)
+    rows = [_rows(edge, along, outward[edge], moves)[0] / evidence.sigma[:, None]]
+    weight = [_information(distance[0] / evidence.sigma, facing, evidence.weight, cut)]
+    samples = samples_per_edge(k)
+    edge, along = np.divmod(np.arange(k * samples), samples)[0][None], np.zeros((1, k * samples))
+    along[0] = np.tile((np.arange(samples) + 0.5) / samples, k)
+    at = outline[0][edge[0]] + along[0][:, None] * step[edge[0]]
+    away, slope, seen = look_up(evidence, at)
+    facing = (slope * outward[edge[0]]).sum(axis=1)
+    sigma = float(np.median(evidence.sigma))
+    each = np.linalg.norm(step, axis=1)[edge[0]] / samples * evidence.density
+    rows.append(_rows(edge, along, outward[edge], moves)[0] / sigma)
+    weight.append(_information(away / sigma, facing, each * seen, cut))
+    slopes = np.vstack(rows)
+    result: Float = (slopes * np.concatenate(weight)[:, None]).T @ slopes
+    return result
+
+
+def _information(residual: Float, facing: Float, weight: Float, cut: float) -> Float:
+    on = (np.abs(residual) < cut) & (facing > ALONG)
+    return np.where(on, _geman_mcclure(residual, weight, cut)[0], 0.0)
 
 
 def _geman_mcclure(residual: Float, weight: Float, cut: Float | float) -> tuple[Float, Float]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core.assembly import assemble
+from vflatten_ros.core.assembly import assemble, undecided
 from vflatten_ros.core.config import AssemblyConfig, Config
 from vflatten_ros.core.contour import trace_outline
 from vflatten_ros.core.values import FlatPiece, FlatPoints, FlatSurface, Flattened, GeodesicLines
@@ -78,3 +78,35 @@ def test_sizes_across_the_cut_carry_the_error_of_the_place():
     assert deviation(sure, "length") == 0.0
     assert deviation(best, "length") == pytest.approx(0.02, rel=0.2)  # its end moves with it
     assert deviation(best, "width") < 0.01  # the main piece shows both its ends
+
+
+def test_all_that_may_win_are_compared_with_their_pieces_in_the_best_places():
+    alike = (*TOWEL, dataclasses.replace(TOWEL[0], category="cloth"))
+    first, second = assemble(cut_towel(), alike, Config())
+    assert first.chance == pytest.approx(second.chance, abs=1e-6)
+
+
+def test_another_way_to_lay_it_flat_is_told_and_makes_sizes_uncertain():
+    best = assembled()
+    size = {name: value for name, (value, _) in measures(best).items()}
+    shorter = best.state.copy()
+    shorter[list(best.template.sizes).index("long_side")] -= 1.0
+    other = dataclasses.replace(best, state=shorter, chance=best.chance - 1.0)
+    odds = 1.0 / (1.0 + np.e)
+
+    def deviation(assembly):
+        return assembly.template.measure(assembly.state, assembly.placing[3:, 3:])["length"][1]
+
+    torn = undecided(best, [other])
+    off = size["length"] - measures(other)["length"][0]
+    assert off > 0.1
+    assert deviation(torn) == pytest.approx(np.hypot(deviation(best), np.sqrt(odds) * off), rel=0.2)
+    assert [n.code for n in torn.flattened.notices] == ["solution_uncertain"]
+    assert "27 %" in torn.flattened.notices[0].text
+    sure = undecided(best, [dataclasses.replace(other, chance=best.chance - 12.0)])
+    assert sure.flattened.notices == ()
+    assert deviation(sure) == pytest.approx(deviation(best), abs=0.001)
+
+
+def measures(assembly):
+    return assembly.template.measure(assembly.state, np.zeros((assembly.template.dimensions,) * 2))

@@ -31,6 +31,7 @@ from vflatten_ros.core.values import (
     FlatSurface,
     Flattened,
     Float,
+    Notice,
     Progress,
     no_progress,
 )
@@ -43,6 +44,8 @@ STIFF = 0.05  # of the swing that is allowed where paths along the cloth are unc
 NEAR_M = 0.02  # beyond the main piece's outline
 CUTS = (6.0, 5.0, 4.0, 3.0, 3.0, 3.0)  # of the fits of the outline, in sigmas
 USUALLY_HIDDEN, HIDDEN_SPREAD = 0.15, 0.15  # share of an item that two well-chosen views leave out
+POLISH = 6.0  # logarithm of odds against a solution that better places of the pieces may turn
+ALMOST, OTHERWISE = 0.05, 0.03  # odds of another solution, and what of a size, that are told
 FINEST_M = 0.001  # steps of the last search for the places of pieces
 HALF_PIXEL_M = 0.00125  # cloth reaches beyond the centres of its outermost pixels
 
@@ -171,28 +174,82 @@ def assemble(
         progress("recognition", 0.4 * done / len(templates))
         fits += _first_fits(prepared, template, config)
     least = min(fit.energy for fit in fits)
-    kept: dict[str, _Trial] = {}
+    trials = []
     for done, fit in enumerate(f for f in fits if f.energy < least + config.assembly.hopeless):
         progress("recognition", 0.4 + 0.2 * done / len(fits))
         trial = _trial(prepared, fit.template, fit.pose, fit.state, config)
-        trial = _alternate(prepared, trial, config, 1)
-        name = fit.template.category
-        if name not in kept or _misfit(trial) < _misfit(kept[name]):
-            kept[name] = trial
-    likely = sorted(kept.values(), key=_misfit)[: config.assembly.categories]
-    worst = _misfit(likely[0]) + config.assembly.hopeless
-    likely = [trial for trial in likely if _misfit(trial) < worst]
+        trials.append(_alternate(prepared, trial, config, 1))
+    likely = _likely(trials, config.assembly)
     found = []
     for done, trial in enumerate(likely):
-        progress("recognition", 0.6 + 0.4 * done / len(likely))
+        progress("recognition", 0.6 + 0.2 * done / len(likely))
         trial = _alternate(prepared, trial, config, config.assembly.alternations - 1)
         found.append((_finished(prepared, trial, config), trial))
+    most = max(assembly.chance for assembly, _ in found)
+    for k, (assembly, trial) in enumerate(found):  # in fairness to all that may win
+        if assembly.chance > most - POLISH:
+            progress("recognition", 0.8 + 0.2 * k / len(found))
+            trial = _polished(prepared, trial, config)
+            found[k] = (_finished(prepared, trial, config), trial)
     found.sort(key=lambda pair: -pair[0].chance)
-    polished = _polished(prepared, found[0][1], config)
-    best = replace(
-        _finished(prepared, polished, config), placing=_placing(prepared, polished, config)
+    best, trial = found[0]
+    ways = [assembly for assembly, _ in found if assembly.template.category == _name(best)]
+    best = replace(best, placing=_placing(prepared, trial, config))
+    others = {_name(assembly): assembly for assembly, _ in reversed(found)}
+    others.pop(_name(best))
+    rest = sorted(others.values(), key=lambda assembly: -assembly.chance)
+    return [undecided(best, ways[1:]), *rest]
+
+
+def _name(assembly: Assembly) -> str:
+    return assembly.template.category
+
+
+def undecided(best: Assembly, others: Sequence[Assembly]) -> Assembly:
+    """The best of a category's ways to fit: uncertain as far as others, of other sizes, are likely.
+
+    Others of the same sizes are the same item, turned as its category's symmetry allows.
+    """
+    others = [other for other in others if _differing(best, other)]
+    if not others or best.placing is None:
+        return best
+    odds = np.exp([0.0, *(other.chance - best.chance for other in others)])
+    share = odds[1:] / odds.sum()
+    off = np.array([np.r_[o.pose, o.state] - np.r_[best.pose, best.state] for o in others])
+    off[:, 0] = np.angle(np.exp(1j * off[:, 0]))
+    placing = best.placing + np.einsum("k,ki,kj->ij", share, off, off)
+    flattened, most = best.flattened, int(share.argmax())
+    if share[most] > ALMOST:
+        told = _differing(best, others[most])
+        text = f"the item may also lie otherwise, at odds of {100 * share[most]:.0f} %: {told}"
+        notice = Notice("solution_uncertain", text)
+        flattened = replace(flattened, notices=(*flattened.notices, notice))
+    return replace(best, placing=placing, flattened=flattened)
+
+
+def _differing(best: Assembly, other: Assembly) -> str:
+    """Width and length of another assembly, where they are others."""
+    nothing = np.zeros((len(best.state), len(best.state)))
+    here, there = (a.template.measure(a.state, nothing) for a in (best, other))
+    return ", ".join(
+        f"{name} {there[name][0]:.3f} instead of {here[name][0]:.3f} m"
+        for name in ("width", "length")
+        if abs(there[name][0] / here[name][0] - 1.0) > OTHERWISE
     )
-    return [best, *(assembly for assembly, _ in found[1:])]
+
+
+def _likely(trials: Sequence[_Trial], config: AssemblyConfig) -> list[_Trial]:
+    """The likeliest trials: a few categories, each in the ways that its outline may fit."""
+    ways: list[_Trial] = []
+    categories: set[str] = set()
+    ordered = sorted(trials, key=_misfit)
+    for trial in ordered:
+        name = trial.template.category
+        worst = _misfit(ordered[0]) + (config.hopeless if name not in categories else POLISH)
+        if _misfit(trial) < worst and (name in categories or len(categories) < config.categories):
+            categories.add(name)
+            ways.append(trial)
+    return ways
 
 
 def _misfit(trial: _Trial) -> float:

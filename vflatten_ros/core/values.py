@@ -246,6 +246,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "low_coverage": "much of the item was not seen",
     "hidden_crease": "a deep crease probably hides cloth",
     "category_uncertain": "two categories fit nearly as well",
+    "solution_uncertain": "the item may lie otherwise, with another width or length",
     "correspondence_rejected": "a corresponding point contradicts the others",
     "high_stress": "the distances contradict each other more than noise explains",
     "truncated": "the item reaches the border of the image",

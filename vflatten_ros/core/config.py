@@ -490,6 +490,18 @@ class RotationConfig(Checked):
     valley_m: float = option(
         0.001, "Deepest groove that a link round a rim may cross, m.", low=0.0, high=0.02
     )
+    ramp: float = option(
+        2.8e-4,
+        "Height of a step (m) times tilt (rad) above which a sample may join two layers.",
+        low=1e-6,
+        high=0.1,
+    )
+    piece: float = option(
+        0.05,
+        "Least share of the surface for a piece apart to be joined again.",
+        low=0.001,
+        high=1.0,
+    )
     landmarks: int = option(300, "Samples whose mutual distances are unfolded.", low=50, high=5000)
     local_m: float = option(
         0.15, "Nearer pairs on one sheet keep their distance both ways, m.", low=0.01, high=2.0
@@ -516,7 +528,10 @@ class RotationConfig(Checked):
         0.01, "Layers nearer than this hide one another's edges, m.", low=0.001, high=0.1
     )
     certain: float = option(
-        0.9, "Certainty of the category below which another hypothesis is tried.", low=0.0, high=1.0
+        0.85,
+        "Certainty of the category below which another hypothesis is tried.",
+        low=0.0,
+        high=1.0,
     )
     overlaid: float = option(
         0.07,

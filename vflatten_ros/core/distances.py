@@ -17,11 +17,13 @@ from scipy.sparse.csgraph import connected_components, dijkstra, shortest_path
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
+from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.values import Bool, Float, Int
 
 Float32 = NDArray[np.float32]
 
 PLACED_BY = 10  # landmarks that place a sample
+LEAST_INSIDE = 0.4  # of the samples in the largest piece
 FIRM_LINKS = 6  # links on the sheet that a landmark needs
 STRAIGHT_LEAST = 0.85  # a chain whose ends are nearer than this share of it went round something
 
@@ -88,7 +90,11 @@ class _Walk:
 
 
 def surface_distances(
-    xyz: Float, normal: Float, a: Int, b: Int, length_m: Float, rim: Bool, config: RotationConfig
+    xyz: Float,
+    normal: Float,
+    links: Links,
+    passable: Bool,
+    config: RotationConfig,
 ) -> Distances:
     """Distances between landmarks of the largest connected piece.
 
@@ -96,28 +102,35 @@ def surface_distances(
     ----------
     xyz, normal : ndarray of shape (n, 3)
         Samples of the surface and their outward normals.
-    a, b, length_m, rim : ndarray of shape (m,)
-        Links between samples, and which of them go round a rim.
+    links : Links
+        Between samples.
+    passable : ndarray of shape (n,)
+        Samples that paths may go through; they may end at any.
 
     Raises
     ------
     DisconnectedSurface
-        Less than half of the samples hang together.
+        Fewer than LEAST_INSIDE of the passable samples hang together.
     """
     count = len(xyz)
-    graph = csr_matrix(
-        (np.r_[length_m, length_m], (np.r_[a, b], np.r_[b, a])), shape=(count, count)
-    )
-    piece = connected_components(graph, directed=False)[1]
-    inside = piece == np.bincount(piece).argmax()
-    if inside.sum() < 0.5 * count:
+    a, b, length_m, rim = links.a, links.b, links.length_m, links.rim
+    piece = pieces(a, b, passable)
+    inside = passable & (piece == np.bincount(piece[passable]).argmax())
+    if inside.sum() < LEAST_INSIDE * passable.sum():
         raise DisconnectedSurface(
-            f"the surface falls into pieces, the largest has {inside.sum()} of {count} samples; "
-            "take more views or raise rotation.link_m"
+            f"the surface falls into pieces, the largest has {inside.sum()} of "
+            f"{passable.sum()} samples; take more views or raise rotation.link_m"
         )
+    start, end = np.r_[a, b], np.r_[b, a]
+    leaving = passable[start]
+    graph = csr_matrix(
+        (np.r_[length_m, length_m][leaving], (start[leaving], end[leaving])), shape=(count, count)
+    )
     # the farthest samples would be strays, which hang on the rest by a link round a rim
-    degree = np.bincount(np.r_[a[~rim], b[~rim]], minlength=count)
+    both = passable[a] & passable[b] & ~rim
+    degree = np.bincount(np.r_[a[both], b[both]], minlength=count)
     firm = inside & (degree >= FIRM_LINKS)
+    inside[end[inside[start]]] = True
     chosen, rows, before = _landmarks(graph, firm, config)
     near = np.isfinite(rows[:, chosen]) & ~np.eye(len(chosen), dtype=bool)
     source, target = np.nonzero(near)
@@ -142,6 +155,15 @@ def surface_distances(
         *_around(walk, min(PLACED_BY, len(chosen) - 1)),
         inside,
     )
+
+
+def pieces(a: Int, b: Int, passable: Bool) -> Int:
+    """Number (n,) of the piece that each passable sample hangs together with; others are alone."""
+    both = passable[a] & passable[b]
+    ones = np.ones(int(both.sum()), dtype=bool)
+    graph = csr_matrix((ones, (a[both], b[both])), shape=(len(passable), len(passable)))
+    label: Int = connected_components(graph, directed=False)[1]
+    return label
 
 
 def _around(walk: _Walk, count: int) -> tuple[Int, Float, Bool]:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.geometry import tangents
 from vflatten_ros.core.values import Bool, Float, Int
 
 NEIGHBOURS = 64  # points used for one fit
@@ -87,7 +88,7 @@ def _fit(
     around, their_normals = points[near], normals[near]
     for band in BANDS_M:
         alike = np.matmul(their_normals, normal[..., None])[..., 0] > 0.5
-        e1, e2 = _tangents(normal)
+        e1, e2 = tangents(normal)
         local = np.matmul(around - at[:, None], np.stack([e1, e2, normal], axis=-1))
         x, y, height = local[..., 0] / radius, local[..., 1] / radius, local[..., 2]
         weight = (1 - (x * x + y * y).clip(0, 1)) ** 2 * np.exp(-0.5 * (height / band) ** 2)
@@ -111,14 +112,6 @@ def _fit(
     row, column = np.nonzero(weight > 0.3)
     seen[row, view[near[row, column]]] = True
     return at, normal, sigma, source.astype(np.int64), seen
-
-
-def _tangents(normal: Float) -> tuple[Float, Float]:
-    """Two unit vectors that make a right-handed frame with each normal."""
-    least = np.abs(normal).argmin(1)
-    e1 = np.cross(normal, np.eye(3)[least])
-    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
-    return e1, np.cross(normal, e1)
 
 
 def _thinned(xyz: Float, normal: Float, sigma: Float, apart_m: float) -> Bool:

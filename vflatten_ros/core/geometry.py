@@ -62,3 +62,11 @@ def transform_directions(transform: Float, directions: Float) -> Float:
     """Rotate (..., 3) directions by a (4, 4) transform."""
     turned: Float = directions @ transform[:3, :3].T
     return turned
+
+
+def tangents(normal: Float) -> tuple[Float, Float]:
+    """Two (n, 3) unit tangents of (n, 3) unit normals; with them they are right-handed."""
+    least = np.abs(normal).argmin(1)
+    e1 = np.cross(normal, np.eye(3)[least])
+    e1 /= np.maximum(np.linalg.norm(e1, axis=1, keepdims=True), 1e-12)
+    return e1, np.cross(normal, e1)

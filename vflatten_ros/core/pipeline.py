@@ -15,7 +15,7 @@ from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.one_view import flatten_one_view
 from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, finish, recognise
 from vflatten_ros.core.registration import ViewSurface, view_surface
-from vflatten_ros.core.rotation import Unfolded, turn_parts, unfold_views, unfold_without_necks
+from vflatten_ros.core.rotation import Surface, Unfolded, turn_parts, unfold_surface, whole_surface
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.two_views import flatten_two_views
@@ -29,6 +29,8 @@ from vflatten_ros.core.values import (
     no_progress,
 )
 
+DOUBTS = (1.0, np.inf, 0.6)  # samples in greater doubt are left out, in the order tried
+CLEARER = 0.05  # by which another try must be more certain
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 
 
@@ -101,9 +103,7 @@ def _rotation(
     prepared: Mapping[int, ViewSurface],
 ) -> tuple[Flattened, Recognition | None]:
     """The automatic method: all views of a rotation."""
-    unfolded, found = _likeliest(
-        views, correspondences, tuple(templates), config, progress, prepared
-    )
+    unfolded, found = _likeliest(views, prepared, tuple(templates), config, progress)
     for _ in range(TURNS if found.category != UNKNOWN else 0):
         fit = found.fits[found.category]
         rest = place(fit.template, fit.pose, fit.template.at_rest(fit.state))[0]
@@ -124,33 +124,49 @@ def _rotation(
 
 def _likeliest(
     views: Sequence[View],
-    correspondences: Sequence[Correspondence],
+    prepared: Mapping[int, ViewSurface],
     templates: tuple[Template, ...],
     config: Config,
     progress: Progress,
-    prepared: Mapping[int, ViewSurface],
 ) -> tuple[Unfolded, Recognition]:
-    """The surface as linked, or if that makes a doubtful item, with its false necks cut."""
-    unfolded = unfold_views(views, correspondences, config.rotation, progress, prepared)
+    """The surface without doubtful places; if that makes a doubtful item, with fewer or more."""
+    surface = whole_surface(views, config.rotation, progress, prepared)
+    best: tuple[Unfolded, Recognition] | None = None
+    failure: DisconnectedSurface | None = None
+    for doubt in DOUBTS:
+        try:
+            tried = _recognised_as(surface, doubt, templates, config, progress)
+        except DisconnectedSurface as error:
+            failure = failure or error
+            continue
+        if best is None or _certainty(tried) > _certainty(best) + CLEARER:
+            best = tried
+        if _certainty(best) > config.rotation.certain:
+            break
+    if best is None:
+        assert failure is not None
+        raise failure
+    return best
+
+
+def _recognised_as(
+    surface: Surface,
+    doubt: float,
+    templates: tuple[Template, ...],
+    config: Config,
+    progress: Progress,
+) -> tuple[Unfolded, Recognition]:
+    unfolded = unfold_surface(surface, doubt, config.rotation, progress)
     progress("recognition", 0.0)
-    found = recognise(unfolded.outline, unfolded.points, templates, config.recognition)
-    if _certainty(found) > config.rotation.certain and unfolded.overlap < config.rotation.overlaid:
-        return unfolded, found
-    try:
-        other = unfold_without_necks(unfolded, config.rotation, progress)
-    except DisconnectedSurface:
-        return unfolded, found
-    again = recognise(other.outline, other.points, templates, config.recognition)
-    overlaid, gained = unfolded.overlap, _certainty(again) - _certainty(found)
-    flatter = overlaid > config.rotation.overlaid and other.overlap < 0.5 * overlaid
-    clearer = gained > 0.2 and other.overlap < overlaid + 0.02
-    return (other, again) if (flatter and gained > -0.1) or clearer else (unfolded, found)
+    return unfolded, recognise(unfolded.outline, unfolded.points, templates, config.recognition)
 
 
-def _certainty(found: Recognition) -> float:
-    """0-1: that the item is of a known category, and how much of its outline the fit explains."""
-    known = 1.0 - found.probabilities.get(UNKNOWN, 0.0)
-    return known * (found.fit.explained if found.fit is not None else 0.0)
+def _certainty(tried: tuple[Unfolded, Recognition]) -> float:
+    """0-1: one category is likeliest by far, its fit explains the outline, and it lies flat."""
+    unfolded, found = tried
+    likely = 0.0 if found.category == UNKNOWN else found.probabilities[found.category]
+    explained = found.fit.explained if found.fit is not None else 0.0
+    return likely * explained * (1.0 - unfolded.overlap)
 
 
 def _described(

@@ -18,12 +18,13 @@ from vflatten_ros.core.distances import Distances, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.fusion import Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
-from vflatten_ros.core.necks import cut_necks
+from vflatten_ros.core.joining import agreeing, find_ties, largest_pieces, near_paths
+from vflatten_ros.core.ramps import ramps
 from vflatten_ros.core.registration import ViewSurface, register_views, view_surface
 from vflatten_ros.core.sheets import Links, link_samples, sheet_edges
 from vflatten_ros.core.unfolding import carry, orientation, overlap, place_samples, settle, unfold
 from vflatten_ros.core.values import (
-    Correspondence,
+    Bool,
     FlatPoints,
     Float,
     Int,
@@ -38,16 +39,20 @@ FIRM = 3  # distances along the sheet that place a sample firmly
 FIRM_SHARE = 0.8  # of the samples, for the others to be left out of the outline
 HIDDEN_M = 0.012  # samples round a point of the outline that say whether it is an edge
 HIDDEN_SHARE = 0.75  # of the edges there that are hidden, above which it is no edge
+SPUR_M = 0.012  # half the width of what is too narrow for a garment
+SPUR_REACH = 0.8  # how far a corner goes beyond a disc in it, in radii
+ROUGH, ROUGH_ROUNDS = 120, 4  # landmarks and reweightings where pieces are laid flat by themselves
+MOST_JOINS = 3
 CELL_M = 0.002  # of the image whose contour is the outline
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Samples of the whole visible surface, linked, and distances along it."""
+    """Samples of the whole visible surface, linked."""
 
     samples: Samples
     links: Links
-    distances: Distances
+    doubt: Float  # (n,) above 1: may be a ramp between two layers
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
 
@@ -57,7 +62,8 @@ class Unfolded:
     """The visible surface, flattened."""
 
     surface: Surface
-    plane: Float  # (k, 2) places of the surface's landmarks
+    distances: Distances
+    plane: Float  # (k, 2) places of the distances' landmarks
     points: FlatPoints  # one measured point near each sample
     side: Float  # (n,) 1 outside up, -1 outside down, 0 unclear
     outline: Outline
@@ -67,56 +73,61 @@ class Unfolded:
     notices: tuple[Notice, ...]
 
 
-def unfold_views(
-    views: Sequence[View],
-    correspondences: Sequence[Correspondence],
-    config: RotationConfig,
-    progress: Progress = no_progress,
-    prepared: Mapping[int, ViewSurface] | None = None,
+def unfold_surface(
+    surface: Surface, doubt: float, config: RotationConfig, progress: Progress = no_progress
 ) -> Unfolded:
-    """Flatten the whole surface that the views show, front and back.
+    """Flatten the surface, front and back, without going through doubtful places where it can.
 
     Parameters
     ----------
-    views : sequence of View
-        Of one rotation, two or more.
-    correspondences : sequence of Correspondence
-        Not needed; checked elsewhere.
-    prepared : mapping of int to ViewSurface, optional
-        Results of view_surface by view_id, made as the views arrived.
-
-    Raises
-    ------
-    NotEnoughViews, DisconnectedSurface
-    """
-    surface = whole_surface(views, config, progress, prepared or {})
-    distances = surface.distances
-    plane = unfold(distances.bound_m, distances.same_sheet, config, progress)
-    progress("outline", 0.0)
-    return _unfolded(surface, plane, config)
-
-
-def unfold_without_necks(
-    unfolded: Unfolded, config: RotationConfig, progress: Progress = no_progress
-) -> Unfolded:
-    """Another hypothesis: the same views, with every narrow place cut that may be false.
+    surface : Surface
+    doubt : float
+        What is more doubtful than this is passed only where pieces are joined.
 
     Raises
     ------
     DisconnectedSurface
     """
-    samples, links = unfolded.surface.samples, unfolded.surface.links
-    progress("necks", 0.0)
-    keep = cut_necks(
-        samples.xyz, samples.normal, links.a, links.b, links.length_m, links.rim, config
-    )
-    links = Links(links.a[keep], links.b[keep], links.length_m[keep], links.rim[keep])
-    distances = surface_distances(
-        samples.xyz, samples.normal, links.a, links.b, links.length_m, links.rim, config
-    )
+    progress("join", 0.0)
+    passable, links = _joined(surface, doubt, config)
+    progress("distances", 0.0)
+    samples = surface.samples
+    distances = surface_distances(samples.xyz, samples.normal, links, passable, config)
     plane = unfold(distances.bound_m, distances.same_sheet, config, progress)
-    surface = replace(unfolded.surface, links=links, distances=distances)
-    return _unfolded(surface, plane, config)
+    progress("outline", 0.0)
+    return _unfolded(surface, distances, plane, config)
+
+
+def _joined(surface: Surface, doubt: float, config: RotationConfig) -> tuple[Bool, Links]:
+    """Samples to go through and links to go along, with the pieces of the surface joined."""
+    samples, links = surface.samples, surface.links
+    passable = surface.doubt < doubt
+    keep = ~links.thick if np.isfinite(doubt) else np.ones(len(links.a), dtype=bool)
+    least = int(config.piece * len(samples.xyz))
+    for _ in range(MOST_JOINS):
+        found = largest_pieces(links.part(keep), passable, least)
+        if len(found) < 2:
+            break
+        ties = find_ties(links, *found[:2])
+        ends = [_laid_flat(surface, links.part(keep), piece, config) for piece in found[:2]]
+        one, other = ends[0][ties.one], ends[1][ties.other]
+        placed = np.flatnonzero(np.isfinite(one).all(1) & np.isfinite(other).all(1))
+        met = placed[agreeing(one[placed], other[placed], ties.length_m[placed])]
+        if not len(met):
+            break
+        near = near_paths(samples.xyz, ties.along(met))
+        passable = passable | near
+        keep = keep | (near[links.a] & near[links.b])
+    return passable, links.part(keep)
+
+
+def _laid_flat(surface: Surface, links: Links, piece: Bool, config: RotationConfig) -> Float:
+    """(n, 2) places of the samples of one piece, roughly; NaN elsewhere."""
+    rough = replace(config, landmarks=ROUGH, unfold_rounds=ROUGH_ROUNDS)
+    distances = surface_distances(surface.samples.xyz, surface.samples.normal, links, piece, rough)
+    plane = unfold(distances.bound_m, distances.same_sheet, rough)
+    uv = place_samples(distances.around, distances.around_m, distances.around_sheet, plane)[0]
+    return np.where(distances.inside[:, None], uv, np.nan)
 
 
 def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationConfig) -> Unfolded:
@@ -127,10 +138,10 @@ def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationCo
     swung, rest : ndarray of shape (k, 2)
         The template's outline as it fits the item, and with its parts at rest.
     """
-    distances = unfolded.surface.distances
+    distances = unfolded.distances
     plane = carry(unfolded.plane, swung, rest)
     plane = settle(plane, distances.bound_m, distances.same_sheet, config)
-    return _unfolded(unfolded.surface, plane, config)
+    return _unfolded(unfolded.surface, distances, plane, config)
 
 
 def whole_surface(
@@ -139,7 +150,21 @@ def whole_surface(
     progress: Progress = no_progress,
     prepared: Mapping[int, ViewSurface] | None = None,
 ) -> Surface:
-    """Register and fuse the views, link the samples and measure along the links."""
+    """Register and fuse the views, and link the samples.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Of one rotation, two or more.
+    config : RotationConfig
+    progress : Progress
+    prepared : mapping of int to ViewSurface, optional
+        Results of view_surface by view_id, made as the views arrived.
+
+    Raises
+    ------
+    NotEnoughViews
+    """
     done = prepared or {}
     surfaces = []
     for k, view in enumerate(views):
@@ -157,21 +182,20 @@ def whole_surface(
     samples = fuse(points, normals, view, config)
     progress("link", 0.0)
     links = link_samples(samples.xyz, samples.normal, config)
-    progress("distances", 0.0)
-    distances = surface_distances(
-        samples.xyz, samples.normal, links.a, links.b, links.length_m, links.rim, config
-    )
+    doubt = ramps(samples.xyz, samples.normal, points, normals, config)
     of_view = view[samples.source]
     pixel = np.zeros((len(of_view), 2), dtype=np.int64)
     for k, each in enumerate(views):
         mine = of_view == k
         pixel[mine] = each.pixel[row[samples.source[mine]]]
     ids = np.array([each.view_id for each in views], dtype=np.int64)
-    return Surface(samples, links, distances, ids[of_view], pixel)
+    return Surface(samples, links, doubt, ids[of_view], pixel)
 
 
-def _unfolded(surface: Surface, plane: Float, config: RotationConfig) -> Unfolded:
-    samples, links, distances = surface.samples, surface.links, surface.distances
+def _unfolded(
+    surface: Surface, distances: Distances, plane: Float, config: RotationConfig
+) -> Unfolded:
+    samples, links = surface.samples, surface.links
     uv, misfit = place_samples(distances.around, distances.around_m, distances.around_sheet, plane)
     side = orientation(uv, samples.xyz, samples.normal, links.a, links.b)
     placed = np.isfinite(uv).all(1) & distances.inside
@@ -200,7 +224,16 @@ def _unfolded(surface: Surface, plane: Float, config: RotationConfig) -> Unfolde
     firm |= firm.mean() < FIRM_SHARE  # too few would leave holes
     outline = outline_of(points.uv[firm], points.sigma_m[firm], edge[placed][firm], config)
     return Unfolded(
-        surface, plane, points, side[placed], outline, points.uv, stress, folded, tuple(notices)
+        surface,
+        distances,
+        plane,
+        points,
+        side[placed],
+        outline,
+        points.uv,
+        stress,
+        folded,
+        tuple(notices),
     )
 
 
@@ -226,6 +259,7 @@ def outline_of(uv: Float, sigma_m: Float, edge: Int, config: RotationConfig) -> 
     inside = (density > config.edge_density * single).astype(np.uint8)
     gap = round(config.close_m / CELL_M)
     inside = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, _disc(gap))
+    inside = _without_spurs(inside, round(SPUR_M / CELL_M))
     contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
         raise DisconnectedSurface("the flattened samples enclose no area; take more views")
@@ -236,6 +270,19 @@ def outline_of(uv: Float, sigma_m: Float, edge: Int, config: RotationConfig) -> 
     near = cKDTree(uv).query(contour)[1]
     inferred = _near(contour, uv[edge == 2]) > HIDDEN_SHARE * _near(contour, uv[edge > 0])
     return Outline(contour, sigma_m[near], inferred)
+
+
+def _without_spurs(inside: NDArray[np.uint8], radius: int) -> NDArray[np.uint8]:
+    """Without what is too narrow for a garment; corners, which a disc does not fill, stay."""
+    wide = cv2.morphologyEx(inside, cv2.MORPH_OPEN, _disc(radius))
+    count, label = cv2.connectedComponents(inside & ~wide & 1, connectivity=4)
+    away = cv2.distanceTransform(1 - wide, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    reach = np.zeros(count)
+    np.maximum.at(reach, label.ravel(), away.ravel())
+    corner = reach < SPUR_REACH * radius
+    corner[0] = False
+    kept: NDArray[np.uint8] = wide | corner[label].astype(np.uint8)
+    return kept
 
 
 def _near(contour: Float, uv: Float) -> Int:

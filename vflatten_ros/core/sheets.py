@@ -17,6 +17,7 @@ from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.values import Bool, Float, Int
 
 RIM_GAP_RAD = np.radians(120)  # a sample with no neighbour in so wide a sector is at an edge
+RIM_REACH_M = 0.010  # rims over which the gap between the two sides is averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,13 @@ class Links:
     b: Int  # (m,)
     length_m: Float  # (m,) along the cloth
     rim: Bool  # (m,) round a sharp edge, rather than on one sheet
+    thick: Bool  # (m,) round an edge that may be a stack of several layers
+
+    def part(self, keep: Bool) -> Links:
+        """Some of the links."""
+        return Links(
+            self.a[keep], self.b[keep], self.length_m[keep], self.rim[keep], self.thick[keep]
+        )
 
 
 def link_samples(xyz: Float, normal: Float, config: RotationConfig) -> Links:
@@ -50,9 +58,31 @@ def link_samples(xyz: Float, normal: Float, config: RotationConfig) -> Links:
     apart = ((normal[b] - normal[a]) * chord).sum(1) / 2
     convex = apart > -config.valley_m
     rim = ~sheet & edge[a] & edge[b] & (alike < 0.3) & (length < config.rim_m) & convex
-    keep = sheet | rim
+    thick = np.zeros(len(a), dtype=bool)
+    thick[rim] = ~_thin(xyz, normal, a[rim], b[rim])
     along = _arc(length, alike) + np.where(rim, config.rim_detour_m, 0.0)
-    return Links(a[keep], b[keep], along[keep], rim[keep])
+    return Links(a, b, along, rim, thick).part(sheet | rim)
+
+
+def _thin(xyz: Float, normal: Float, a: Int, b: Int) -> Bool:
+    """Rims whose sides are no farther apart than those of most.
+
+    The outer sides of a stack of layers whose edges lie flush are farther apart than the two sides
+    of one seam or hem.
+    """
+    if len(a) < 8:
+        return np.ones(len(a), dtype=bool)
+    across = normal[b] - normal[a]
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+    gap = ((xyz[b] - xyz[a]) * across).sum(1)
+    i, j = cKDTree((xyz[a] + xyz[b]) / 2).query_pairs(RIM_REACH_M, output_type="ndarray").T
+    along = np.abs((across[i] * across[j]).sum(1)) > 0.5
+    i, j = i[along], j[along]
+    total = gap + np.bincount(i, gap[j], len(a)) + np.bincount(j, gap[i], len(a))
+    mean = total / (1 + np.bincount(i, minlength=len(a)) + np.bincount(j, minlength=len(a)))
+    low, high = np.quantile(mean, (0.25, 0.75))
+    thin: Bool = mean < high + (high - low)
+    return thin
 
 
 def sheet_edges(xyz: Float, normal: Float, a: Int, b: Int, config: RotationConfig) -> Int:

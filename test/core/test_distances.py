@@ -24,9 +24,10 @@ def rolled(radius_m: float, width_m: float = 0.2, height_m: float = 0.2, seed: i
     return xyz, normal, flat
 
 
-def measured(xyz, normal, config=CONFIG):
+def measured(xyz, normal, config=CONFIG, passable=None):
     links = link_samples(xyz, normal, config)
-    return surface_distances(xyz, normal, links.a, links.b, links.length_m, links.rim, config)
+    passable = np.ones(len(xyz), dtype=bool) if passable is None else passable
+    return surface_distances(xyz, normal, links, passable, config)
 
 
 @pytest.mark.parametrize("radius_m", [0.05, 0.1, 10.0])
@@ -56,3 +57,21 @@ def test_two_sheets_far_apart_raise():
     twice = np.vstack([xyz + np.array([x, 0.0, 0.0]) for x in (0.0, 1.0, 2.0)])
     with pytest.raises(DisconnectedSurface, match="pieces"):
         measured(twice, np.vstack([normal] * 3))
+
+
+def test_paths_go_round_samples_in_doubt_and_may_end_at_them():
+    xyz, normal, flat = rolled(10.0, width_m=0.2, height_m=0.2)
+    wall = (np.abs(flat[:, 0] - 0.1) < 0.007) & (flat[:, 1] < 0.12)
+    found = measured(xyz, normal, passable=~wall)
+    at = flat[found.chosen]
+    assert not wall[found.chosen].any()
+    left = np.argmin(np.linalg.norm(at - [0.05, 0.05], axis=1))
+    right = np.argmin(np.linalg.norm(at - [0.15, 0.05], axis=1))
+    tip = np.array([0.1, 0.12])
+    round_it = np.linalg.norm(at[left] - tip) + np.linalg.norm(at[right] - tip)
+    straight = np.linalg.norm(at[left] - at[right])
+    assert round_it > 1.2 * straight
+    assert 0.97 < found.bound_m[left, right] / round_it < 1.06
+    rim_of_wall = wall & (np.abs(flat[:, 0] - 0.1) > 0.004)
+    assert found.inside[rim_of_wall].mean() > 0.9
+    assert np.isfinite(found.around_m[found.inside]).any(1).all()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.necks import cut_necks
 from vflatten_ros.core.sheets import link_samples, sheet_edges
 
 CONFIG = RotationConfig()
@@ -64,22 +63,18 @@ def test_layers_that_face_each_other_are_not_linked():
     assert between(links, layer, 0, 1) == 0
 
 
-def test_a_short_contact_with_a_long_way_round_is_cut():
-    """A strip bent to a ring, whose ends touch over 2 cm: the contact is a neck."""
-    rng = np.random.default_rng(5)
-    grid = np.mgrid[0:0.62:0.004, 0:0.1:0.004].reshape(2, -1).T
-    flat = grid + rng.uniform(-0.0007, 0.0007, grid.shape)
-    angle = 2 * np.pi * flat[:, 0] / 0.62
-    notch = (flat[:, 0] > 0.612) & (
-        np.abs(flat[:, 1] - 0.05) > 0.01
-    )  # the ends touch in the middle
-    notch |= (flat[:, 0] < 0.008) & (np.abs(flat[:, 1] - 0.05) > 0.01)
-    flat, angle = flat[~notch], angle[~notch]
-    normal = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
-    xyz = 0.62 / (2 * np.pi) * normal + flat[:, 1:] * UP
-    links = link_samples(xyz, normal, CONFIG)
-    contact = np.abs(flat[links.a, 0] - flat[links.b, 0]) > 0.3
-    assert contact.sum() > 5
-    keep = cut_necks(xyz, normal, links.a, links.b, links.length_m, links.rim, CONFIG)
-    assert not keep[contact].any() or (~keep).sum() > 5
-    assert keep[~contact].mean() > 0.98
+def test_the_edges_of_a_stack_are_in_doubt_beside_those_of_single_seams():
+    parts, normals, stacked = [], [], []
+    for k in range(6):  # five folds 2 mm thick, and the outer sides of a stack of 5 mm
+        thick = 0.005 if k == 5 else 0.002
+        for side, z in ((1.0, 0.0), (-1.0, -thick)):
+            parts.append(sheet(0.2 * k, 0.2 * k + 0.06, 0, 0.1, z=z, seed=2 * k + (side > 0)))
+            normals.append(np.tile(side * UP, (len(parts[-1]), 1)))
+            stacked.append(np.full(len(parts[-1]), k == 5))
+    xyz, stack = np.vstack(parts), np.concatenate(stacked)
+    links = link_samples(xyz, np.vstack(normals), CONFIG)
+    of_stack = stack[links.a[links.rim]]
+    assert of_stack.sum() > 20
+    assert (links.doubt[links.rim][of_stack] > 1.0).mean() > 0.9
+    assert (links.doubt[links.rim][~of_stack] < 1.0).mean() > 0.9
+    assert not links.doubt[~links.rim].any()

@@ -527,32 +527,11 @@ class RotationConfig(Checked):
     hidden_m: float = option(
         0.01, "Layers nearer than this hide one another's edges, m.", low=0.001, high=0.1
     )
-    certain: float = option(
-        0.85,
-        "Certainty of the category below which another hypothesis is tried.",
-        low=0.0,
-        high=1.0,
-    )
-    overlaid: float = option(
-        0.07,
-        "Share of the surface lying on more of its side that asks for another hypothesis.",
-        low=0.0,
-        high=1.0,
-    )
     untrusted_overlap: float = option(
         0.1,
         "Share of the surface lying on more of its side above which the result says so.",
         low=0.0,
         high=1.0,
-    )
-    neck_m: float = option(
-        0.03,
-        "Radius of a disc without which the surface round a false neck falls in two, m.",
-        low=0.005,
-        high=0.2,
-    )
-    detour_m: float = option(
-        0.12, "Shortest way round a neck that may be false, m.", low=0.01, high=5.0
     )
     unfold_rounds: int = option(10, "Reweightings at each strength of spreading.", low=1, high=1000)
 

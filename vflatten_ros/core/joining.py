@@ -43,7 +43,8 @@ class Ties:
             at = np.unique(self.before[at])
             at = at[at >= 0]
             found.append(at)
-        return np.unique(np.concatenate(found))
+        samples: Int = np.unique(np.concatenate(found))
+        return samples
 
 
 def largest_pieces(links: Links, passable: Bool, least: int) -> list[Bool]:

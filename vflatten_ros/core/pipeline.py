@@ -24,13 +24,17 @@ from vflatten_ros.core.values import (
     FlatGarment,
     Flattened,
     GeodesicLines,
+    Notice,
     Progress,
     View,
     no_progress,
 )
 
-DOUBTS = (1.0, np.inf, 0.6)  # samples in greater doubt are left out, in the order tried
-CLEARER = 0.05  # by which another try must be more certain
+DOUBTS = (np.inf, 1.0, 0.6, 0.4)  # what is in greater doubt does not join the surface
+ALWAYS = 2  # that are tried however good the first ones are
+GOOD = 0.0  # badness below which no more are tried
+DOUBTFUL = 0.4  # badness above which the result is not to be trusted
+LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 
 
@@ -104,6 +108,7 @@ def _rotation(
 ) -> tuple[Flattened, Recognition | None]:
     """The automatic method: all views of a rotation."""
     unfolded, found = _likeliest(views, prepared, tuple(templates), config, progress)
+    badness = _badness((unfolded, found))
     for _ in range(TURNS if found.category != UNKNOWN else 0):
         fit = found.fits[found.category]
         rest = place(fit.template, fit.pose, fit.template.at_rest(fit.state))[0]
@@ -111,13 +116,17 @@ def _rotation(
         unfolded = turn_parts(unfolded, fit.points()[:k], rest[:k], config.rotation)
         found = _refitted(unfolded, found, tuple(templates), config)
     none = np.zeros(0)
+    notices = unfolded.notices
+    if badness > DOUBTFUL:
+        text = f"no category fits the item well, or it does not lie flat ({badness:.1f})"
+        notices = (*notices, Notice("untrusted", text))
     flattened = Flattened(
         points=unfolded.points,
         start_uv=None,
         lines=GeodesicLines(np.zeros((0, 2, 3)), none.astype(np.int64), none, none, none > 0),
         outline=unfolded.outline,
         correspondences=(),
-        notices=unfolded.notices,
+        notices=notices,
     )
     return flattened, found
 
@@ -129,24 +138,20 @@ def _likeliest(
     config: Config,
     progress: Progress,
 ) -> tuple[Unfolded, Recognition]:
-    """The surface without doubtful places; if that makes a doubtful item, with fewer or more."""
+    """The surface with and without doubtful places, whichever makes the better item."""
     surface = whole_surface(views, config.rotation, progress, prepared)
-    best: tuple[Unfolded, Recognition] | None = None
-    failure: DisconnectedSurface | None = None
-    for doubt in DOUBTS:
-        try:
-            tried = _recognised_as(surface, doubt, templates, config, progress)
-        except DisconnectedSurface as error:
-            failure = failure or error
-            continue
-        if best is None or _certainty(tried) > _certainty(best) + CLEARER:
-            best = tried
-        if _certainty(best) > config.rotation.certain:
+    tries: list[tuple[Unfolded, Recognition]] = []
+    failures: list[DisconnectedSurface] = []
+    for number, doubt in enumerate(DOUBTS):
+        if number >= ALWAYS and tries and min(map(_badness, tries)) < GOOD:
             break
-    if best is None:
-        assert failure is not None
-        raise failure
-    return best
+        try:
+            tries.append(_recognised_as(surface, doubt, templates, config, progress))
+        except DisconnectedSurface as error:
+            failures.append(error)
+    if not tries:
+        raise failures[0]
+    return min(tries, key=_badness)
 
 
 def _recognised_as(
@@ -161,12 +166,16 @@ def _recognised_as(
     return unfolded, recognise(unfolded.outline, unfolded.points, templates, config.recognition)
 
 
-def _certainty(tried: tuple[Unfolded, Recognition]) -> float:
-    """0-1: one category is likeliest by far, its fit explains the outline, and it lies flat."""
+def _badness(tried: tuple[Unfolded, Recognition]) -> float:
+    """How badly the best category fits, and how far from flat the item lies.
+
+    A garment laid flat has one layer of either side everywhere; more say that layers were joined
+    that are not.
+    """
     unfolded, found = tried
-    likely = 0.0 if found.category == UNKNOWN else found.probabilities[found.category]
-    explained = found.fit.explained if found.fit is not None else 0.0
-    return likely * explained * (1.0 - unfolded.overlap)
+    misfit = found.fit.misfit if found.fit is not None else np.inf
+    folded = max(0.0, unfolded.overlap - LAID) / MOSTLY_LAID
+    return float(misfit + folded + (found.category == UNKNOWN))
 
 
 def _described(

@@ -22,6 +22,7 @@ STEP_HEIGHT_M = 0.006
 STEP_POINTS = 64
 STEP_SOFT = 0.15  # width of the step, in reaches
 DIRECTIONS = 6  # of the step
+NOISE_SIGMAS = 1.0  # of its height that noise alone makes of the best of all directions
 CHUNK = 4096  # samples at a time: bounds the memory
 
 
@@ -120,5 +121,9 @@ def _step(at: Float, normal: Float, points: Float, normals: Float, tree: cKDTree
     size = (steps**2).sum(1) + 1e-6
     best = (match**2 / size).argmax(1)
     rows = np.arange(len(at))
-    height_m: Float = 2 * np.abs(match[rows, best] / size[rows, best])
+    match, size = match[rows, best], size[rows, best]
+    left = (weight * rest**2).sum(1) - match**2 / size
+    sigma = np.sqrt(np.maximum(left, 0.0) / np.maximum(weight.sum(1) - 8.0, 1.0) / size)
+    certain = np.maximum((match / size) ** 2 - (NOISE_SIGMAS * sigma) ** 2, 0.0)
+    height_m: Float = 2 * np.sqrt(certain)
     return height_m

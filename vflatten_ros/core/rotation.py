@@ -43,6 +43,7 @@ SPUR_M = 0.012  # half the width of what is too narrow for a garment
 SPUR_REACH = 0.8  # how far a corner goes beyond a disc in it, in radii
 ROUGH, ROUGH_ROUNDS = 120, 4  # landmarks and reweightings where pieces are laid flat by themselves
 MOST_JOINS = 3
+MOST_DOUBTFUL = 0.1  # of the samples, at a doubt of 1
 CELL_M = 0.002  # of the image whose contour is the outline
 
 
@@ -101,8 +102,11 @@ def unfold_surface(
 def _joined(surface: Surface, doubt: float, config: RotationConfig) -> tuple[Bool, Links]:
     """Samples to go through and links to go along, with the pieces of the surface joined."""
     samples, links = surface.samples, surface.links
-    passable = surface.doubt < doubt
-    keep = ~links.thick if np.isfinite(doubt) else np.ones(len(links.a), dtype=bool)
+    # noisy or sparse points look like steps anywhere
+    passable = surface.doubt < max(
+        doubt, float(np.quantile(surface.doubt, 1 - MOST_DOUBTFUL / doubt))
+    )
+    keep = links.doubt < doubt
     least = int(config.piece * len(samples.xyz))
     for _ in range(MOST_JOINS):
         found = largest_pieces(links.part(keep), passable, least)

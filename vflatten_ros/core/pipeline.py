@@ -15,7 +15,14 @@ from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.one_view import flatten_one_view
 from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, finish, recognise
 from vflatten_ros.core.registration import ViewSurface, view_surface
-from vflatten_ros.core.rotation import Surface, Unfolded, turn_parts, unfold_surface, whole_surface
+from vflatten_ros.core.rotation import (
+    Surface,
+    Unfolded,
+    look_for_ramps,
+    turn_parts,
+    unfold_surface,
+    whole_surface,
+)
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.two_views import flatten_two_views
@@ -31,9 +38,8 @@ from vflatten_ros.core.values import (
 )
 
 DOUBTS = (np.inf, 1.0, 0.6, 0.4)  # what is in greater doubt does not join the surface
-ALWAYS = 2  # that are tried however good the first ones are
-GOOD = 0.0  # badness below which no more are tried
-DOUBTFUL = 0.4  # badness above which the result is not to be trusted
+ENOUGH = (-0.5, 0.0, 0.0)  # badness below which no more than one, two, three are tried
+DOUBTFUL = 0.3  # badness above which the result is not to be trusted
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 
@@ -142,9 +148,11 @@ def _likeliest(
     surface = whole_surface(views, config.rotation, progress, prepared)
     tries: list[tuple[Unfolded, Recognition]] = []
     failures: list[DisconnectedSurface] = []
-    for number, doubt in enumerate(DOUBTS):
-        if number >= ALWAYS and tries and min(map(_badness, tries)) < GOOD:
+    for doubt, enough in zip(DOUBTS, (-np.inf, *ENOUGH), strict=True):
+        if tries and min(map(_badness, tries)) < enough:
             break
+        if np.isfinite(doubt) and not surface.doubt.any():
+            surface = look_for_ramps(surface, config.rotation, progress)
         try:
             tries.append(_recognised_as(surface, doubt, templates, config, progress))
         except DisconnectedSurface as error:

@@ -53,7 +53,10 @@ class Surface:
 
     samples: Samples
     links: Links
-    doubt: Float  # (n,) above 1: may be a ramp between two layers
+    edge: Int  # (n,) of sheet_edges
+    doubt: Float  # (n,) above 1: may be a ramp between two layers; 0 before look_for_ramps
+    points: Float  # (m, 3) registered points of all views that the samples were fitted to
+    normals: Float  # (m, 3)
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
 
@@ -186,14 +189,34 @@ def whole_surface(
     samples = fuse(points, normals, view, config)
     progress("link", 0.0)
     links = link_samples(samples.xyz, samples.normal, config)
-    doubt = ramps(samples.xyz, samples.normal, points, normals, config)
+    edge = _edges(samples, links, config)
     of_view = view[samples.source]
     pixel = np.zeros((len(of_view), 2), dtype=np.int64)
     for k, each in enumerate(views):
         mine = of_view == k
         pixel[mine] = each.pixel[row[samples.source[mine]]]
     ids = np.array([each.view_id for each in views], dtype=np.int64)
-    return Surface(samples, links, doubt, ids[of_view], pixel)
+    doubt = np.zeros(len(samples.xyz))
+    return Surface(samples, links, edge, doubt, points, normals, ids[of_view], pixel)
+
+
+def look_for_ramps(
+    surface: Surface, config: RotationConfig, progress: Progress = no_progress
+) -> Surface:
+    """The same surface, with the samples in doubt that may join two layers."""
+    progress("ramps", 0.0)
+    samples = surface.samples
+    doubt = ramps(samples.xyz, samples.normal, surface.points, surface.normals, config)
+    return replace(surface, doubt=doubt)
+
+
+def _edges(samples: Samples, links: Links, config: RotationConfig) -> Int:
+    sheet = ~links.rim
+    edge = sheet_edges(samples.xyz, samples.normal, links.a[sheet], links.b[sheet], config)
+    # what both sides of were seen ends there, whatever lies on it
+    rim = links.rim & (links.doubt < 1.0)
+    edge[np.r_[links.a[rim], links.b[rim]]] = 1
+    return edge
 
 
 def _unfolded(
@@ -218,15 +241,13 @@ def _unfolded(
         text = f"distances contradict each other by {1e3 * stress:.0f} mm"
         notices.append(Notice("high_stress", text))
     folded = overlap(plane, distances.bound_m, side[distances.chosen])
-    sheet = ~links.rim
-    edge = sheet_edges(samples.xyz, samples.normal, links.a[sheet], links.b[sheet], config)
     if folded > config.untrusted_overlap:
         text = f"{100 * folded:.0f} % of the surface lies on more of its own side: not laid flat"
         notices.append(Notice("untrusted", text))
     # what is placed round rims alone has upper bounds only, and so lies too far out
     firm = (distances.around_sheet.sum(1) >= FIRM)[placed]
     firm |= firm.mean() < FIRM_SHARE  # too few would leave holes
-    outline = outline_of(points.uv[firm], points.sigma_m[firm], edge[placed][firm], config)
+    outline = outline_of(points.uv[firm], points.sigma_m[firm], surface.edge[placed][firm], config)
     return Unfolded(
         surface,
         distances,

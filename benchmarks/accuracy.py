@@ -9,7 +9,13 @@ Every recording is flattened with all views and no manual input (rotation), by t
 after the result is there, to compare.
 """
 
+# ruff: noqa: E402  (threads must be limited before numpy is imported)
+
 from __future__ import annotations
+
+from vflatten_ros import threads
+
+threads.use_one()  # as the command does: the same bits
 
 import argparse
 import dataclasses

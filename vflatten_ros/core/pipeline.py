@@ -40,6 +40,10 @@ from vflatten_ros.core.values import (
 DOUBTS = (np.inf, 1.0, 0.6, 0.4)  # what is in greater doubt does not join the surface
 ENOUGH = (-0.5, 0.0, 0.0)  # badness below which no more than one, two, three are tried
 DOUBTFUL = 0.3  # badness above which the result is not to be trusted
+STRAYS, MOSTLY_LEFT = (
+    0.06,
+    0.2,
+)  # share of samples that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 
@@ -175,15 +179,16 @@ def _recognised_as(
 
 
 def _badness(tried: tuple[Unfolded, Recognition]) -> float:
-    """How badly the best category fits, and how far from flat the item lies.
+    """How badly the best category fits, how far from flat the item lies, what it leaves out.
 
     A garment laid flat has one layer of either side everywhere; more say that layers were joined
-    that are not.
+    that are not. A piece alone may look like a whole item of another kind.
     """
     unfolded, found = tried
     misfit = found.fit.misfit if found.fit is not None else np.inf
     folded = max(0.0, unfolded.overlap - LAID) / MOSTLY_LAID
-    return float(misfit + folded + (found.category == UNKNOWN))
+    left_out = max(0.0, 1.0 - float(unfolded.distances.inside.mean()) - STRAYS) / MOSTLY_LEFT
+    return float(misfit + folded + left_out + (found.category == UNKNOWN))
 
 
 def _described(

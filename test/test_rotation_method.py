@@ -1,0 +1,73 @@
+"""All views of the carried recordings, no manual input, against the truth of the simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from recordings import BAGS
+
+from vflatten_ros.core import pipeline
+from vflatten_ros.core.config import Config
+from vflatten_ros.replay import replay_recording
+
+ALL_VIEWS = dataclasses.replace(Config(), method="rotation")
+
+
+def point_error_m(garment, folder):
+    """Median distance of the flattened points from the truth, rigidly aligned."""
+    with np.load(folder / "truth.npz") as truth:
+        place = np.full([int(truth[key].max()) + 1 for key in ("view", "row", "col")], -1)
+        place[truth["view"], truth["row"], truth["col"]] = np.arange(len(truth["u"]))
+        row, col = garment.points.pixel.T
+        index = place[garment.points.view_id, row, col]
+        true = np.column_stack([truth["u"], truth["v"]])[index[index >= 0]]
+    flat = garment.points.uv[index >= 0]
+    keep = np.ones(len(flat), dtype=bool)
+    for _ in range(4):
+        a, b = flat[keep], true[keep]
+        left, _, right = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
+        error = np.linalg.norm((flat - a.mean(0)) @ left @ right + b.mean(0) - true, axis=1)
+        keep = error <= np.quantile(error, 0.9)
+    return float(np.median(error))
+
+
+def errors(garment, folder):
+    truth = json.loads((folder / "truth.json").read_text())
+    sizes = {"width": truth["W"], "length": truth["L"]}
+    return truth["category"], [
+        abs(garment.measurement(name).value_m / size - 1.0) for name, size in sizes.items()
+    ]
+
+
+def untrusted(garment):
+    return any(notice.code == "untrusted" for notice in garment.notices)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["LS1_1", "SH1_1", "TR1_1", "SK2_1"])
+def test_category_sizes_and_places_come_out_right(name):
+    garment = replay_recording(BAGS / name, ALL_VIEWS).garment
+    category, wrong = errors(garment, BAGS / name)
+    assert garment.category == category
+    assert max(wrong) < 0.07
+    assert point_error_m(garment, BAGS / name) < 0.01
+    assert not untrusted(garment)
+
+
+@pytest.mark.slow
+def test_layers_that_lie_flush_spoil_the_skirt_unless_they_are_looked_for(monkeypatch):
+    monkeypatch.setattr(pipeline, "DOUBTS", (np.inf,))
+    monkeypatch.setattr(pipeline, "ENOUGH", ())
+    garment = replay_recording(BAGS / "SK2_1", ALL_VIEWS).garment
+    assert untrusted(garment)
+    assert max(errors(garment, BAGS / "SK2_1")[1]) > 0.07
+
+
+@pytest.mark.slow
+def test_a_quarter_of_a_rotation_is_not_trusted_or_says_what_was_not_seen():
+    garment = replay_recording(BAGS / "LS1_1", ALL_VIEWS, view_ids=range(6)).garment
+    codes = {notice.code for notice in garment.notices}
+    assert codes & {"untrusted", "width_unseen", "length_unseen"}

@@ -205,7 +205,10 @@ def test_the_installed_commands_start_one_node_that_can_flatten(ros, tmp_path, c
         rig.until(
             lambda: rig.diagnostics("mine")["flattening"][""] == "idle", "the flattening process"
         )
-        assert rig.planner.get_node_names_and_namespaces().count(me) == 1
+        # names arrive by themselves, maybe after the topics
+        names = rig.planner.get_node_names_and_namespaces
+        rig.until(lambda: me in names(), "the node's name")
+        assert names().count(me) == 1
         assert "Traceback" not in rig.node.log()
         assert rig.node.stop() == 0
     finally:

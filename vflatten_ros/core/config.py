@@ -521,6 +521,12 @@ class RotationConfig(Checked):
     uv_sigma_m: float = option(
         0.004, "Least standard deviation of a flattened point, m.", low=1e-4, high=0.1
     )
+    outline_sigma_m: float = option(
+        0.0035,
+        "Error that all of an outline shares, so that no length of it averages it out, m.",
+        low=0.0,
+        high=0.1,
+    )
     high_stress_m: float = option(
         0.01, "Contradiction of distances above which the result says so, m.", low=1e-4, high=1.0
     )

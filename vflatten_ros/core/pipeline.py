@@ -210,6 +210,11 @@ def _described(
     measured = measure(recognition, outline, points, config.measurement)
     automatic = config.method == "rotation"
     used = sorted({int(i) for i in points.view_id if i >= 0})
+    shared = np.sqrt(2.0) * config.rotation.outline_sigma_m if automatic else 0.0  # of two ends
+    measurements = tuple(
+        replace(m, sigma_m=float(np.hypot(m.sigma_m, shared))) for m in measured.measurements
+    )
+    told = {notice.code for notice in flattened.notices}
     return FlatGarment(
         method=config.method,
         view_ids=tuple(used),
@@ -222,12 +227,12 @@ def _described(
         scores=recognition.probabilities if automatic else recognition.scores,
         score_kind="probability" if automatic else "R",
         template_uv=recognition.template_uv,
-        measurements=measured.measurements,
+        measurements=measurements,
         landmarks=measured.landmarks,
         correspondences=flattened.correspondences,
         coverage=measured.coverage,
         quality=measured.quality,
-        notices=flattened.notices + measured.notices,
+        notices=flattened.notices + tuple(n for n in measured.notices if n.code not in told),
     )
 
 

@@ -43,12 +43,11 @@ class SlowWork:
 def example_or_trouble(what, progress):
     from vflatten_ros.core.errors import NotEnoughViews
 
-    progress("work", 0.0)
-    if what == SILENT:
-        time.sleep(30.0)  # without a word
-    if what == STUBBORN:
+    if what == STUBBORN:  # before it says that it works, or a quick cancel is heard
         signal.pthread_sigmask(signal.SIG_BLOCK, {STOP})  # as a long computation in C
-        time.sleep(30.0)
+    progress("work", 0.0)
+    if what in (SILENT, STUBBORN):
+        time.sleep(30.0)  # without a word
     if what == CRASH:
         os._exit(7)
     if what == WRONG:

@@ -40,10 +40,7 @@ from vflatten_ros.core.values import (
 DOUBTS = (np.inf, 1.0, 0.6, 0.4)  # what is in greater doubt does not join the surface
 ENOUGH = (-0.5, 0.0, 0.0)  # badness below which no more than one, two, three are tried
 DOUBTFUL = 0.3  # badness above which the result is not to be trusted
-STRAYS, MOSTLY_LEFT = (
-    0.06,
-    0.2,
-)  # share of samples that any result leaves out; more that counts as 1
+STRAYS, MOSTLY_LEFT = 0.06, 0.2  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 

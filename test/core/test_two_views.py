@@ -5,49 +5,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from garments import BELOW_TIP_M, CALIBRATION
+import sheet
+from sheet import ANGLES_RAD, HEIGHT_M, WIDTH_M, seen_from
 
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import InvalidCorrespondence, NotEnoughViews
-from vflatten_ros.core.geometry import transform_points
 from vflatten_ros.core.two_views import creases, flatten_two_views
-from vflatten_ros.core.values import Correspondence, View
-
-RADIUS_M, WIDTH_M, HEIGHT_M = 0.1, 0.26, 0.25  # 149 degrees of a cylinder
-ANGLES_RAD = (-0.7, 0.7)  # the sheet's sides turn more than 90 degrees away
-
-
-def seen_from(view_id: int, angle_rad: float, rows=480, cols=360, focal=520.0):
-    """The sheet where the rays of the camera meet it, and its flat places."""
-    T_rig_hanger = CALIBRATION.T_rig_hanger(angle_rad)
-    row, col = (v.ravel() for v in np.mgrid[0:rows, 0:cols])
-    ray = np.c_[(col - (cols - 1) / 2) / focal, (row - (rows - 1) / 2) / focal, np.ones(len(row))]
-    eye = -T_rig_hanger[:3, :3].T @ T_rig_hanger[:3, 3]
-    way = ray @ T_rig_hanger[:3, :3]
-    a, b = (way[:, :2] ** 2).sum(1), way[:, :2] @ eye[:2]
-    root = b**2 - a * (eye[:2] @ eye[:2] - RADIUS_M**2)
-    met = root > 0
-    depth = (-b[met] - np.sqrt(root[met])) / a[met]
-    at = eye + depth[:, None] * way[met]
-    u, v = RADIUS_M * np.arctan2(at[:, 1], at[:, 0]), at[:, 2] + BELOW_TIP_M
-    inside = (np.abs(u) < WIDTH_M / 2) & (v < 0) & (v > -HEIGHT_M)
-    pixel = np.c_[row[met], col[met]][inside].astype(np.int32)
-    points = transform_points(T_rig_hanger, at[inside])
-    view = View(view_id, 0, angle_rad, points, pixel, None, (rows, cols), CALIBRATION)
-    return view, np.c_[u, v][inside]
-
+from vflatten_ros.core.values import Correspondence
 
 VIEWS, FLAT = zip(*(seen_from(k, angle) for k, angle in enumerate(ANGLES_RAD)), strict=True)
 
 
 def pair_at(u: float, v: float, slip_m: float = 0.0) -> Correspondence:
-    """The pixels nearest to a place of the cloth; `slip_m` to the side of it in the second view."""
-    near = [
-        int(np.linalg.norm(flat - place, axis=1).argmin())
-        for flat, place in zip(FLAT, ([u, v], [u + slip_m, v]), strict=True)
-    ]
-    a, b = (tuple(view.pixel[i].tolist()) for view, i in zip(VIEWS, near, strict=True))
-    return Correspondence(0, 1, a, b)
+    return sheet.pair_at(VIEWS, FLAT, u, v, slip_m)
 
 
 PAIRS = [pair_at(u, v) for u, v in ((0.0, -0.03), (0.02, -0.2), (-0.02, -0.12))]

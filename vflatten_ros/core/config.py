@@ -281,6 +281,30 @@ class IntegrationConfig(Checked):
 
 
 @dataclass(frozen=True)
+class CorrespondenceConfig(Checked):
+    """Corresponding points that are found without a person."""
+
+    count: int = option(8, "Most points found for two views.", low=2, high=1000)
+    reach_m: float = option(
+        0.003, "Points of two registered views farther apart are not the same, m.",
+        low=5e-4, high=0.05,
+    )  # fmt: skip
+    features: bool = option(True, "Look for features of the colour image, too.")
+    feature_reach_m: float = option(
+        0.015, "How far a feature may be from where the surfaces put it, m.", low=0.001, high=0.2
+    )
+    feature_ratio: float = option(
+        0.8, "Most that a feature may differ, as a share of the next best.", low=0.1, high=1.0
+    )
+    feature_most: float = option(
+        300.0, "Most that features of the same place differ in their descriptor.", low=1.0, high=1e4
+    )
+    feature_agree_m: float = option(
+        0.004, "Features agree that one motion brings this near, m.", low=0.001, high=0.05
+    )
+
+
+@dataclass(frozen=True)
 class FlatteningConfig(Checked):
     """Distances to plane (paper, section 2.2)."""
 
@@ -555,6 +579,7 @@ class Config:
     patches: PatchConfig = PatchConfig()
     geodesics: GeodesicConfig = GeodesicConfig()
     integration: IntegrationConfig = IntegrationConfig()
+    correspondences: CorrespondenceConfig = CorrespondenceConfig()
     flattening: FlatteningConfig = FlatteningConfig()
     assembly: AssemblyConfig = AssemblyConfig()
     contour: ContourConfig = ContourConfig()

@@ -85,6 +85,16 @@ def consistent_pairs(points_a: Float, points_b: Float, config: IntegrationConfig
     return keep
 
 
+def misses(points_a: Float, points_b: Float, keep: Bool) -> Float:
+    """(k,) how far, in metres, each pair is from where the shift of the others kept puts it."""
+    off = points_a - points_b
+    miss = np.empty(len(off))
+    for k in range(len(off)):
+        others = keep & (np.arange(len(off)) != k)
+        miss[k] = np.linalg.norm(off[k] - off[others].mean(axis=0)) if others.any() else np.inf
+    return miss
+
+
 def _miss_without(points_a: Float, points_b: Float, one: int) -> float:
     """How far a pair is from where the motion of all others puts it."""
     others = np.arange(len(points_a)) != one

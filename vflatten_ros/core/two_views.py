@@ -24,6 +24,7 @@ from vflatten_ros.core.boundary import (
 )
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.contour import outline_of_polygons, trace_outline
+from vflatten_ros.core.correspondences import rejected
 from vflatten_ros.core.errors import (
     DisconnectedSurface,
     InvalidCorrespondence,
@@ -38,6 +39,7 @@ from vflatten_ros.core.integration import (
     consistent_pairs,
     join,
     merged,
+    misses,
     network_of,
     start_places,
     unknowns,
@@ -46,6 +48,7 @@ from vflatten_ros.core.observation import Observation, edges, locate, observe, q
 from vflatten_ros.core.sampling import thinned
 from vflatten_ros.core.unrolling import Complex, Relations, carry, frames_of, unroll
 from vflatten_ros.core.values import (
+    Bool,
     Correspondence,
     DistanceNetwork,
     FlatPiece,
@@ -66,6 +69,8 @@ LINES_PER_POINT = 1  # geodesic lines that start at a boundary point
 POINT_SIGMA_M = 0.002  # of a flattened point, whatever its stress
 MISFIT_M = 0.003  # of neighbours, beyond which they lose their say when unrolled
 SMALLEST = 0.05  # share of the main piece's samples that makes a piece worth placing
+FEWEST_PAIRS = 2  # that fix one view's place in the plane of the other
+JUDGED = 3  # points given that contradict one another cannot judge, if no more, which is wrong
 MOSTLY_LOOSE = 0.55  # share of the samples outside the main piece beyond which sizes are a guess
 
 
@@ -106,54 +111,136 @@ def flatten_two_views(
     DisconnectedSurface
         Nothing joins the two views.
     """
-    pair = _observe_pair(views, correspondences, config, progress)
-    method = _from_boundaries if config.integration.evidence == "boundary" else _from_surfaces
-    return method(pair, config, progress)
-
-
-def _observe_pair(
-    views: Sequence[View], given: Sequence[Correspondence], config: Config, progress: Progress
-) -> _Pair:
-    first, second = _two_views(views, given)
-    pixels = [
-        (c.pixel_a, c.pixel_b) if c.view_a == first.view_id else (c.pixel_b, c.pixel_a)
-        for c in given
-    ]
+    if len(views) > 1 and len(correspondences) < FEWEST_PAIRS:
+        raise InvalidCorrespondence(
+            "the two-view method needs two corresponding points or more (the paper: three to "
+            f"five), got {len(correspondences)}; give them with --protocol or by the service "
+            "add_correspondences"
+        )
+    first, second = named_views(views, correspondences)
     with ThreadPoolExecutor(1) as other:  # numpy leaves the interpreter free for the second core
         waiting = other.submit(observe, second, config, no_progress)
         a = observe(first, config, progress)
         b = waiting.result()
-    reach = config.integration.pair_reach_px
-    at_a = np.array([locate(a, p, reach) for p, _ in pixels])
-    at_b = np.array([locate(b, q, reach) for _, q in pixels])
-    keep = consistent_pairs(a.surface.points[at_a], b.surface.points[at_b], config.integration)
-    if keep.sum() < 2:
+    return flatten_pair(a, b, correspondences, (), config, progress)
+
+
+def flatten_pair(
+    a: Observation,
+    b: Observation,
+    given: Sequence[Correspondence],
+    found: Sequence[Correspondence],
+    config: Config,
+    progress: Progress = no_progress,
+) -> Flattened:
+    """The same from what the two views show.
+
+    Parameters
+    ----------
+    a, b : Observation
+    given : sequence of Correspondence
+        Points that a person gave; those that agree are all used.
+    found : sequence of Correspondence
+        Others, the best first. They fill up where fewer than two that agree were given, and help
+        to tell which is wrong where those that were given contradict one another.
+    config : Config
+
+    Raises
+    ------
+    InvalidCorrespondence
+    DisconnectedSurface
+    """
+    pair = _corresponding(a, b, given, found, config)
+    method = _from_boundaries if config.integration.evidence == "boundary" else _from_surfaces
+    return method(pair, config, progress)
+
+
+def _corresponding(
+    a: Observation,
+    b: Observation,
+    given: Sequence[Correspondence],
+    found: Sequence[Correspondence],
+    config: Config,
+) -> _Pair:
+    own = _located(a, b, given, config)
+    keep = consistent_pairs(own.points_a, own.points_b, config.integration)
+    if found and (keep.sum() < FEWEST_PAIRS or (not keep.all() and len(keep) <= JUDGED)):
+        more = _located(a, b, found, config)
+        more = more.part(np.flatnonzero(more.on_patches)[: config.correspondences.count])
+        own = own.with_more(more)
+        keep = consistent_pairs(own.points_a, own.points_b, config.integration)
+    if keep.sum() < FEWEST_PAIRS:
         raise InvalidCorrespondence(
             f"the {len(keep)} corresponding points contradict one another: at most {keep.sum()} "
             "can be points of one item that hangs still; check them"
         )
-    notices = tuple(_rejected(c) for c, kept in zip(given, keep, strict=True) if not kept)
-    used = tuple(c for c, kept in zip(given, keep, strict=True) if kept)
-    return _Pair(a, b, at_a[keep], at_b[keep], used, notices)
-
-
-def _rejected(pair: Correspondence) -> Notice:
-    text = (
-        f"view {pair.view_a} pixel {pair.pixel_a} and view {pair.view_b} pixel {pair.pixel_b} are "
-        "not the same point of the item, if the other corresponding points are right; left out"
+    off = misses(own.points_a, own.points_b, keep)
+    notices = tuple(
+        rejected(pair, off[k]) for k, pair in enumerate(own.pairs) if pair.manual and not keep[k]
     )
-    return Notice("correspondence_rejected", text)
+    used = tuple(pair for pair, kept in zip(own.pairs, keep, strict=True) if kept)
+    return _Pair(a, b, own.at_a[keep], own.at_b[keep], used, notices)
 
 
-def _two_views(views: Sequence[View], given: Sequence[Correspondence]) -> tuple[View, View]:
+@dataclass(frozen=True, eq=False)
+class _Located:
+    """Corresponding points and the rows of both views' points that they are."""
+
+    a: Observation
+    b: Observation
+    pairs: tuple[Correspondence, ...]
+    at_a: Int  # (k,)
+    at_b: Int
+
+    @property
+    def points_a(self) -> Float:
+        points: Float = self.a.surface.points[self.at_a]
+        return points
+
+    @property
+    def points_b(self) -> Float:
+        points: Float = self.b.surface.points[self.at_b]
+        return points
+
+    @property
+    def on_patches(self) -> Bool:
+        on: Bool = (self.a.patch[self.at_a] >= 0) & (self.b.patch[self.at_b] >= 0)
+        return on
+
+    def part(self, rows: Int) -> _Located:
+        pairs = tuple(self.pairs[k] for k in rows)
+        return _Located(self.a, self.b, pairs, self.at_a[rows], self.at_b[rows])
+
+    def with_more(self, other: _Located) -> _Located:
+        at = np.r_[self.at_a, other.at_a], np.r_[self.at_b, other.at_b]
+        return _Located(self.a, self.b, self.pairs + other.pairs, *at)
+
+
+def _located(
+    a: Observation, b: Observation, pairs: Sequence[Correspondence], config: Config
+) -> _Located:
+    turned = [
+        (p.pixel_a, p.pixel_b) if p.view_a == a.view.view_id else (p.pixel_b, p.pixel_a)
+        for p in pairs
+    ]
+    reach = config.integration.pair_reach_px
+    at_a = np.array([locate(a, p, reach) for p, _ in turned], dtype=np.int64)
+    at_b = np.array([locate(b, q, reach) for _, q in turned], dtype=np.int64)
+    return _Located(a, b, tuple(pairs), at_a, at_b)
+
+
+def named_views(views: Sequence[View], given: Sequence[Correspondence]) -> tuple[View, View]:
+    """The two views, in their order, that corresponding points name.
+
+    Raises
+    ------
+    NotEnoughViews
+        Fewer than two views, or one that is not there.
+    InvalidCorrespondence
+        Another number of views is named.
+    """
     if len(views) < 2:
         raise NotEnoughViews(f"the two-view method needs two views, got {len(views)}")
-    if len(given) < 2:
-        raise InvalidCorrespondence(
-            "the two-view method needs two corresponding points or more (the paper: three to "
-            f"five), got {len(given)}; give them with --protocol or by the service "
-            "add_correspondences"
-        )
     named = sorted({c.view_a for c in given} | {c.view_b for c in given})
     by_id = {view.view_id: view for view in views}
     unknown = [i for i in named if i not in by_id]

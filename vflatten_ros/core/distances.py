@@ -25,6 +25,8 @@ Float32 = NDArray[np.float32]
 PLACED_BY = 10  # landmarks that place a sample
 LEAST_INSIDE = 0.4  # of the samples in the largest piece
 FIRM_LINKS = 6  # links on the sheet that a landmark needs
+GROUP = 32  # landmarks whose paths are laid out together: bounds the memory
+BLOCK = 512  # samples whose nearest landmarks are found together, so that they stay in the cache
 STRAIGHT_LEAST = 0.85  # a chain whose ends are nearer than this share of it went round something
 
 
@@ -53,7 +55,7 @@ class _Steps:
 
 @dataclass(frozen=True, eq=False)
 class _Walk:
-    """Shortest paths from landmarks, walked back to straighten them."""
+    """Shortest paths from landmarks, laid out to straighten them."""
 
     rows: Float32  # (k, n) length of the paths
     before: NDArray[np.int32]  # (k, n) sample before each on its path
@@ -71,22 +73,48 @@ class _Walk:
         return np.where(usable, straight, path / stretch), usable
 
     def _straight(self, landmark: Int, sample: Int) -> tuple[Float, Int]:
-        """Walk all paths at once: distance between their laid out ends, and rims on the way."""
-        source, count = self.chosen[landmark], self.rows.shape[1]
-        at, total = sample.astype(np.int64), np.zeros(len(sample), dtype=complex)
-        turn = np.ones(len(sample), dtype=complex)
-        rims = np.zeros(len(sample), dtype=np.int64)
-        walking = np.flatnonzero(at != source)
-        while len(walking):
-            here = at[walking]
-            there = self.before[landmark[walking], here].astype(np.int64)
-            link = np.searchsorted(self.steps.key, here * count + there)
-            total[walking] += turn[walking] * self.steps.step[link]
-            turn[walking] *= self.steps.turn[link]
-            rims[walking] += self.steps.rim[link]
-            at[walking] = there
-            walking = walking[there != source[walking]]
-        return np.abs(total), rims
+        """Distance between the laid out ends of all paths, and rims on the way."""
+        straight = np.empty(len(sample))
+        rims = np.empty(len(sample), dtype=np.int64)
+        order = np.argsort(landmark.astype(np.int16), kind="stable")
+        firsts = range(0, len(self.chosen), GROUP)
+        ends = np.searchsorted(landmark[order], [*firsts, len(self.chosen)])
+        for first, low, high in zip(firsts, ends[:-1], ends[1:], strict=True):
+            some = order[low:high]
+            straight[some], rims[some] = self._straight_from(first, landmark[some], sample[some])
+        return straight, rims
+
+    def _straight_from(self, first: int, landmark: Int, sample: Int) -> tuple[Float, Int]:
+        """The same from GROUP landmarks, each path laid out from that of the sample before it."""
+        count = self.rows.shape[1]
+        before = self.before[first : first + GROUP].ravel()
+        home = np.arange(len(before) // count) * count + self.chosen[first : first + GROUP]
+        wanted = (landmark - first) * count + sample
+        needed = np.zeros(len(before), dtype=bool)
+        needed[wanted] = needed[home] = True
+        new = wanted[before[wanted] >= 0]
+        while len(new):
+            new = new - new % count + before[new]
+            new = np.unique(new[~needed[new]])
+            needed[new] = True
+        needed[home] = False
+        place = np.flatnonzero(needed)
+        here, there = place % count, before[place].astype(np.int64)
+        origin = place - here + there
+        link = np.searchsorted(self.steps.key, here * count + there)
+        step, turn, rim = self.steps.step[link], self.steps.turn[link], self.steps.rim[link]
+        total = np.zeros(len(before), dtype=complex)
+        rims = np.zeros(len(before), dtype=np.int64)
+        waiting = np.arange(len(place))
+        while len(waiting):
+            ready = ~needed[origin[waiting]]
+            now = waiting[ready]
+            at, back = place[now], origin[now]
+            total[at] = step[now] + turn[now] * total[back]
+            rims[at] = rim[now] + rims[back]
+            needed[at] = False
+            waiting = waiting[~ready]
+        return np.abs(total[wanted]), rims[wanted]
 
 
 def surface_distances(
@@ -168,13 +196,16 @@ def pieces(a: Int, b: Int, passable: Bool) -> Int:
 
 def _around(walk: _Walk, count: int) -> tuple[Int, Float, Bool]:
     """Landmarks nearest to each sample, and how far they are."""
-    nearest = np.argpartition(walk.rows, count, axis=0)[:count].T
+    nearest = np.empty((walk.rows.shape[1], count), dtype=np.int64)
+    for start in range(0, len(nearest), BLOCK):
+        rows = np.ascontiguousarray(walk.rows[:, start : start + BLOCK].T)
+        nearest[start : start + BLOCK] = np.argpartition(rows, count, axis=1)[:, :count]
     sample = np.broadcast_to(np.arange(len(nearest))[:, None], nearest.shape)
     reached = np.isfinite(walk.rows[nearest, sample])
     length = np.full(nearest.shape, np.inf)
     sheet = np.zeros(nearest.shape, dtype=bool)
     length[reached], sheet[reached] = walk.lengths(nearest[reached], sample[reached])
-    return nearest.astype(np.int64), length, sheet
+    return nearest, length, sheet
 
 
 def _landmarks(

@@ -8,6 +8,8 @@ somewhere; and otherwise the points spread. No panels, seams or correspondences 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
@@ -17,6 +19,7 @@ from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 UPON_M = 0.015  # landmarks this near in the plane lie on one another ...
 UPON_FAR_M = 0.08  # ... if they are this far apart along the cloth
 STAY = 1e-6  # weight of the present distance of every pair: keeps the equations regular
+BLOCK = 4096  # samples placed at a time, so that they stay in the cache
 SPREAD = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # weight of distances that fall short, in turn
 
 
@@ -37,19 +40,19 @@ def unfold(
     ndarray of shape (k, 2)
         Metres; position, rotation and mirror image are arbitrary but repeatable.
     """
-    plane = _classical_scaling(bound)
+    plane, aims = _classical_scaling(bound), _aims(bound, near)
     rounds = [spread for spread in SPREAD for _ in range(config.unfold_rounds)]
     for done, spread in enumerate(rounds):
         progress("unfold", done / len(rounds))
-        plane = _majorise(plane, bound, near, spread)
+        plane = _majorise(plane, aims, spread)
     return plane
 
 
 def settle(plane: Float, bound: Float, near: Bool, config: RotationConfig) -> Float:
     """Keep bounds and near distances, from where the points are, without spreading any more."""
-    centre = plane.mean(0)
+    centre, aims = plane.mean(0), _aims(bound, near)
     for _ in range(config.unfold_rounds):
-        plane = _majorise(plane, bound, near, 0.0)
+        plane = _majorise(plane, aims, 0.0)
     settled: Float = plane + centre
     return settled
 
@@ -97,28 +100,58 @@ def _along(outline: Float, per_edge: int = 20) -> Float:
     return points.reshape(-1, 2)
 
 
-def _majorise(plane: Float, bound: Float, near: Bool, spread: float) -> Float:
+@dataclass(frozen=True, eq=False)
+class _Aims:
+    """Bounds, and what the weights of stress majorisation take from them."""
+
+    bound: Float  # (k, k)
+    near: Bool  # (k, k)
+    base: Float  # (k, k) weight of a pair
+    stay: Float  # (k, k) of its present distance
+    slack: Float  # (k, k) how far a near pair may fall short
+
+
+def _aims(bound: Float, near: Bool) -> _Aims:
+    safe = np.where(bound > 0, bound, 1.0)
+    base = (bound > 0) / safe**1.5
+    return _Aims(bound, near, base, STAY * base, 0.2 * safe)
+
+
+def _majorise(plane: Float, aims: _Aims, spread: float) -> Float:
     """Three steps of stress majorisation (de Leeuw 1977) under weights taken from the residuals."""
     k = len(plane)
-    safe = np.where(bound > 0, bound, 1.0)
+    bound, base = aims.bound, aims.base
     flat = _pairwise(plane)
     short = np.maximum(bound - flat, 0.0)
-    robust = np.maximum(spread, 1 / (1 + (short / (0.2 * safe)) ** 2))
-    base = (bound > 0) / safe**1.5
-    weight = np.where(short > 0, np.where(near, robust, spread), 1.0) * base
-    target = weight * bound + STAY * base * flat  # a pair without any say stays where it is
-    weight = weight + STAY * base
-    factor = cho_factor(np.diag(weight.sum(1)) - weight + 1 / k)  # 1/k: fixes the centroid
+    robust = short / aims.slack
+    robust *= robust
+    robust += 1.0
+    np.maximum(np.divide(1.0, robust, out=robust), spread, out=robust)
+    weight = np.where(short > 0, np.where(aims.near, robust, spread), 1.0)
+    weight *= base
+    flat *= aims.stay  # a pair without any say stays where it is
+    target = weight * bound
+    target += flat
+    weight += aims.stay
+    system = 1 / k - weight  # 1/k: fixes the centroid
+    system[np.diag_indices(k)] += weight.sum(1)
+    factor = cho_factor(system, overwrite_a=True, check_finite=False)
     for _ in range(3):
-        ratio = target / np.maximum(_pairwise(plane), 1e-9)
-        plane = cho_solve(factor, ratio.sum(1)[:, None] * plane - ratio @ plane)
+        apart = _pairwise(plane)
+        ratio = np.divide(target, np.maximum(apart, 1e-9, out=apart), out=apart)
+        force = ratio.sum(1)[:, None] * plane - ratio @ plane
+        plane = cho_solve(factor, force, overwrite_b=True, check_finite=False)
     return plane
 
 
 def _pairwise(plane: Float) -> Float:
     x, y = plane.T
-    apart: Float = np.sqrt((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2)
-    return apart
+    apart: Float = x[:, None] - x
+    apart *= apart
+    across = y[:, None] - y
+    across *= across
+    apart += across
+    return np.sqrt(apart, out=apart)
 
 
 def _classical_scaling(bound: Float) -> Float:
@@ -153,25 +186,42 @@ def place_samples(around: Int, around_m: Float, sheet: Bool, plane: Float) -> tu
     misfit_m : ndarray of shape (n,)
         Root of the mean squared excess over the distances, inf where uv is NaN.
     """
+    uv, misfit = np.empty((len(around), 2)), np.empty(len(around))
+    for start in range(0, len(around), BLOCK):
+        some = slice(start, start + BLOCK)
+        uv[some], misfit[some] = _placed(around[some].T, around_m[some].T, sheet[some].T, plane)
+    return uv, misfit
+
+
+def _placed(around: Int, around_m: Float, sheet: Bool, plane: Float) -> tuple[Float, Float]:
+    """place_samples of (p, n) distances."""
     known = np.isfinite(around_m)
     distance = np.where(known, around_m, 0.0)
     base = np.where(known, 1 / (distance + 0.005) ** 2, 0.0) * np.where(sheet, 1.0, 0.1)
-    anchors = plane[around]
-    uv = (base[..., None] * anchors).sum(1) / np.maximum(base.sum(1), 1e-9)[:, None]
+    total = np.maximum(base.sum(0), 1e-9)
+    x, y = plane[:, 0][around], plane[:, 1][around]
+    u, v = (base * x).sum(0) / total, (base * y).sum(0) / total
+    shorter, longer = 1 / (0.2 * distance + 0.003), 1 / 0.01
     for _ in range(8):
-        offset = uv[:, None] - anchors
-        apart = np.maximum(np.linalg.norm(offset, axis=2), 1e-6)
+        du, dv = u - x, v - y
+        apart = np.maximum(np.sqrt(du * du + dv * dv), 1e-6)
         excess = apart - distance
-        slack = np.where(excess < 0, excess / (0.2 * distance + 0.003), excess / 0.01)
-        weight = base / (1 + slack**2)
-        along = offset / apart[..., None]
+        slack = excess * np.where(excess < 0, shorter, longer)
+        weight = base / (1 + slack * slack)
+        du /= apart
+        dv /= apart
         # damped: a single ring of landmarks leaves the direction across it loose
-        matrix = (weight[..., None] * along).transpose(0, 2, 1) @ along
-        matrix += 0.05 * weight.sum(1)[:, None, None] * np.eye(2) + 1e-9 * np.eye(2)
-        force = (along * (weight * excess)[..., None]).sum(1)
-        uv = uv - np.linalg.solve(matrix, force[..., None])[..., 0]
-    misfit = np.sqrt((base * excess.clip(0) ** 2).sum(1) / np.maximum(base.sum(1), 1e-9))
-    few = known.sum(1) < 3
+        damping = 0.05 * weight.sum(0) + 1e-9
+        pull = weight * excess
+        fu, fv = (pull * du).sum(0), (pull * dv).sum(0)
+        weight_u = weight * du
+        uu, cross = (weight_u * du).sum(0) + damping, (weight_u * dv).sum(0)
+        vv = (weight * dv * dv).sum(0) + damping
+        size = uu * vv - cross * cross
+        u, v = u - (vv * fu - cross * fv) / size, v - (uu * fv - cross * fu) / size
+    uv = np.column_stack([u, v])
+    misfit = np.sqrt((base * excess.clip(0) ** 2).sum(0) / total)
+    few = known.sum(0) < 3
     uv[few], misfit[few] = np.nan, np.inf
     return uv, misfit
 

@@ -14,10 +14,11 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.geometry import tangents
-from vflatten_ros.core.values import Bool, Float, Int
+from vflatten_ros.core.parallel import mapped
+from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 NEIGHBOURS = 64  # points used for one fit
-CHUNK = 4096  # samples fitted at a time: bounds the memory
+CHUNK = 1024  # samples fitted at a time: they stay in the cache
 BANDS_M = (0.003, 0.002, 0.0015)  # height (Gaussian) of the successive fits
 MIN_CELL = 3  # points that make a sample
 
@@ -33,7 +34,13 @@ class Samples:
     views: Bool  # (n, view) which views see it
 
 
-def fuse(points: Float, normals: Float, view: Int, config: RotationConfig) -> Samples:
+def fuse(
+    points: Float,
+    normals: Float,
+    view: Int,
+    config: RotationConfig,
+    progress: Progress = no_progress,
+) -> Samples:
     """Samples about `spacing_m` apart on every layer that any view saw.
 
     Parameters
@@ -42,13 +49,22 @@ def fuse(points: Float, normals: Float, view: Int, config: RotationConfig) -> Sa
         Registered points of all views and their outward normals, common frame.
     view : ndarray of shape (n,)
         Which view each point comes from, from 0.
+    config : RotationConfig
+    progress : Progress
     """
+    progress("fuse", 0.0)
     start, direction = _cells(points, normals, config.spacing_m)
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-    parts = [
-        _fit(start[a : a + CHUNK], direction[a : a + CHUNK], points, normals, view, tree, config)
-        for a in range(0, len(start), CHUNK)
-    ]
+    firsts = range(0, len(start), CHUNK)
+
+    def fitted(first: int) -> tuple[Float, Float, Float, Int, Bool]:
+        some = slice(first, first + CHUNK)
+        return _fit(start[some], direction[some], points, normals, view, tree, config)
+
+    parts = []
+    for part in mapped(fitted, firsts):
+        parts.append(part)
+        progress("fuse", len(parts) / len(firsts))
     joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
     xyz, normal, sigma, source, seen = joined
     keep = _thinned(xyz, normal, sigma, 0.55 * config.spacing_m)

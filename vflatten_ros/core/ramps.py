@@ -23,7 +23,7 @@ STEP_POINTS = 64
 STEP_SOFT = 0.15  # width of the step, in reaches
 DIRECTIONS = 6  # of the step
 NOISE_SIGMAS = 1.0  # of its height that noise alone makes of the best of all directions
-CHUNK = 4096  # samples at a time: bounds the memory
+CHUNK = 1024  # samples at a time, so that they stay in the cache
 
 
 def ramps(

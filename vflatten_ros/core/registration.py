@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,7 +19,8 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.geometry import Float, inverse, rigid, rotation_about, transform_points
-from vflatten_ros.core.values import Int, View
+from vflatten_ros.core.parallel import mapped
+from vflatten_ros.core.values import Int, Progress, View, no_progress
 
 MIN_POINTS = 100  # a view with fewer item points shows nothing that could be placed
 PAIR_POINTS = 300.0  # noise is alike in neighbouring pixels: more pairs than this say no more
@@ -36,6 +38,7 @@ class ViewSurface:
     normals: Float  # (n, 3) unit, towards the camera: outwards
     index: Int  # (n,) row of the view's points
     camera: Float  # (3,) hanger frame
+    tree: cKDTree  # of smooth
 
 
 def view_surface(view: View, config: RotationConfig) -> ViewSurface:
@@ -67,6 +70,7 @@ def view_surface(view: View, config: RotationConfig) -> ViewSurface:
         normals[good],
         np.flatnonzero(good),
         camera,
+        cKDTree(smooth[good]),
     )
 
 
@@ -84,13 +88,17 @@ def _planes(points: Float, radius_m: float, neighbours: int = 24) -> tuple[Float
     return smooth, normals, found.sum(1)
 
 
-def register_views(surfaces: Sequence[ViewSurface], config: RotationConfig) -> list[Float]:
+def register_views(
+    surfaces: Sequence[ViewSurface], config: RotationConfig, progress: Progress = no_progress
+) -> list[Float]:
     """Correction of every view, so that views that see the same cloth agree.
 
     Parameters
     ----------
     surfaces : sequence of ViewSurface
         At least two, in any order.
+    config : RotationConfig
+    progress : Progress
 
     Returns
     -------
@@ -105,14 +113,18 @@ def register_views(surfaces: Sequence[ViewSurface], config: RotationConfig) -> l
     if len(surfaces) < 2:
         raise NotEnoughViews(f"registration: got {len(surfaces)} views, expected 2 or more")
     pairs = _overlapping([s.angle_rad for s in surfaces], config.overlap_deg)
+    partners = [[i for i, j in pairs if j == to] for to in range(len(surfaces))]
     thin = [_thinned(s, config.register_points) for s in surfaces]
-    trees = [cKDTree(s.smooth, balanced_tree=False, compact_nodes=False) for s in surfaces]
     poses = [np.eye(4) for _ in surfaces]
     prior = _prior(surfaces, config)
-    for _ in range(config.register_rounds):
+    for done in range(config.register_rounds):
+        progress("register", done / config.register_rounds)
+        moved = [_seen_from(s, rows, p) for s, rows, p in zip(surfaces, thin, poses, strict=True)]
         normal, gradient = prior.copy(), prior @ _parameters(poses, len(prior))
-        for i, j in pairs:
-            _add_pair(normal, gradient, i, j, surfaces, thin, trees, poses, config)
+        work = partial(_equations, moved, partners, surfaces, poses, config)
+        for j, equations in enumerate(mapped(work, range(len(surfaces)))):
+            for i, block, slope in equations:
+                _add_pair(normal, gradient, i, j, block, slope)
         step = -np.linalg.solve(normal, gradient)[: 6 * len(poses)].reshape(-1, 6)
         poses = [_moved(pose, change) for pose, change in zip(poses, step, strict=True)]
         if np.abs(step).max() < 2e-5:  # 20 micrometres: far below the noise
@@ -176,37 +188,56 @@ def _parameters(poses: Sequence[Float], size: int) -> Float:
     return flat
 
 
-def _add_pair(
-    normal: Float,
-    gradient: Float,
-    i: int,
-    j: int,
+def _seen_from(surface: ViewSurface, rows: Int, pose: Float) -> tuple[Float, Float]:
+    """Some points and normals of a view in the common frame."""
+    return transform_points(pose, surface.smooth[rows]), surface.normals[rows] @ pose[:3, :3].T
+
+
+def _equations(
+    moved: Sequence[tuple[Float, Float]],
+    partners: Sequence[Sequence[int]],
     surfaces: Sequence[ViewSurface],
-    thin: Sequence[Int],
-    trees: Sequence[cKDTree],
     poses: Sequence[Float],
     config: RotationConfig,
-) -> None:
-    """Add the distances of view i's points from view j's surface to the normal equations."""
-    rows = thin[i]
-    moved = transform_points(poses[i], surfaces[i].smooth[rows])
-    inside_j = transform_points(inverse(poses[j]), moved)
-    distance, near = trees[j].query(inside_j, distance_upper_bound=config.register_reach_m)
+    j: int,
+) -> list[tuple[int, Float, Float]]:
+    """Normal equations of the distances of its partners' points from view j's surface.
+
+    Returns
+    -------
+    list of (int, ndarray of shape (6, 6), ndarray of shape (6,))
+        Partner, information, gradient.
+    """
+    if not partners[j]:
+        return []
+    owner = np.repeat(partners[j], [len(moved[i][0]) for i in partners[j]])
+    a = np.vstack([moved[i][0] for i in partners[j]])
+    normals_i = np.vstack([moved[i][1] for i in partners[j]])
+    surface, pose = surfaces[j], poses[j]
+    inside_j = transform_points(inverse(pose), a)
+    distance, near = surface.tree.query(inside_j, distance_upper_bound=config.register_reach_m)
     found = np.flatnonzero(np.isfinite(distance))
-    normals_j = surfaces[j].normals[near[found]] @ poses[j][:3, :3].T
-    normals_i = surfaces[i].normals[rows[found]] @ poses[i][:3, :3].T
-    alike = (normals_i * normals_j).sum(1) > 0.8
-    found, n = found[alike], normals_j[alike]
-    if len(found) < 10:
-        return
-    a = moved[found]
-    b = transform_points(poses[j], surfaces[j].smooth[near[found]])
+    n = surface.normals[near[found]] @ pose[:3, :3].T
+    alike = (normals_i[found] * n).sum(1) > 0.8
+    found, n = found[alike], n[alike]
+    a, owner = a[found], owner[found]
+    b = transform_points(pose, surface.smooth[near[found]])
     error = ((a - b) * n).sum(1)
-    scale = config.noise_m * 2
-    weight = config.noise_m**-2 * min(1.0, PAIR_POINTS / len(found)) / (1 + (error / scale) ** 2)
+    robust = config.noise_m**-2 / (1 + (error / (config.noise_m * 2)) ** 2)
     jacobian = np.hstack([np.cross(a, n), n])
-    block = jacobian.T @ (weight[:, None] * jacobian)
-    slope = jacobian.T @ (weight * error)
+    equations = []
+    for i in partners[j]:
+        mine = owner == i
+        count = int(mine.sum())
+        if count < 10:
+            continue
+        rows = jacobian[mine]
+        weight = robust[mine] * min(1.0, PAIR_POINTS / count)
+        equations.append((i, rows.T @ (weight[:, None] * rows), rows.T @ (weight * error[mine])))
+    return equations
+
+
+def _add_pair(normal: Float, gradient: Float, i: int, j: int, block: Float, slope: Float) -> None:
     at_i, at_j = slice(6 * i, 6 * i + 6), slice(6 * j, 6 * j + 6)
     normal[at_i, at_i] += block
     normal[at_j, at_j] += block

@@ -19,8 +19,8 @@ FIRST_GUESS: Mapping[str, Mapping[str, float]] = {
         "recognition": 0.3, "measurement": 0.1, "messages": 0.1,
     },
     "rotation": {
-        "surface": 0.7, "register": 0.4, "fuse": 0.7, "link": 0.1, "distances": 0.8, "unfold": 0.6,
-        "outline": 0.2, "recognition": 0.7, "measurement": 0.1, "messages": 0.1,
+        "surface": 0.1, "register": 0.3, "fuse": 0.5, "link": 0.4, "distances": 0.6, "unfold": 0.4,
+        "outline": 0.1, "recognition": 0.4, "parts": 0.4, "measurement": 0.1, "messages": 0.1,
     },
 }  # fmt: skip
 START_PAUSE_S = 5.0  # before another try, if the process cannot even start

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra, shortest_path
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.sheets import Links
-from vflatten_ros.core.values import Bool, Float, Int
+from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 Float32 = NDArray[np.float32]
 
@@ -123,6 +123,7 @@ def surface_distances(
     links: Links,
     passable: Bool,
     config: RotationConfig,
+    progress: Progress = no_progress,
 ) -> Distances:
     """Distances between landmarks of the largest connected piece.
 
@@ -134,12 +135,15 @@ def surface_distances(
         Between samples.
     passable : ndarray of shape (n,)
         Samples that paths may go through; they may end at any.
+    config : RotationConfig
+    progress : Progress
 
     Raises
     ------
     DisconnectedSurface
         Fewer than LEAST_INSIDE of the passable samples hang together.
     """
+    progress("distances", 0.0)
     count = len(xyz)
     a, b, length_m, rim = links.a, links.b, links.length_m, links.rim
     piece = pieces(a, b, passable)
@@ -159,9 +163,10 @@ def surface_distances(
     degree = np.bincount(np.r_[a[both], b[both]], minlength=count)
     firm = inside & (degree >= FIRM_LINKS)
     inside[end[inside[start]]] = True
-    chosen, rows, before = _landmarks(graph, firm, config)
+    chosen, rows, before = _landmarks(graph, firm, config, progress)
     near = np.isfinite(rows[:, chosen]) & ~np.eye(len(chosen), dtype=bool)
     source, target = np.nonzero(near)
+    progress("distances", 0.6)
     steps = _steps(xyz, normal, a, b, length_m, rim)
     walk = _Walk(rows, before, chosen, steps, config.rim_detour_m)
     length, usable = walk.lengths(source, chosen[target])
@@ -176,6 +181,7 @@ def surface_distances(
         raise DisconnectedSurface(
             "landmarks farther apart than rotation.local_m; raise it or rotation.landmarks"
         )
+    progress("distances", 0.7)
     return Distances(
         chosen,
         (bound + bound.T) / 2,
@@ -209,7 +215,7 @@ def _around(walk: _Walk, count: int) -> tuple[Int, Float, Bool]:
 
 
 def _landmarks(
-    graph: csr_matrix, firm: Bool, config: RotationConfig
+    graph: csr_matrix, firm: Bool, config: RotationConfig, progress: Progress
 ) -> tuple[Int, Float32, NDArray[np.int32]]:
     """Farthest-point landmarks, their distances to all samples near them, and the paths there."""
     limit = config.local_m
@@ -219,6 +225,8 @@ def _landmarks(
     rows = np.empty((most, len(firm)), dtype=np.float32)
     before = np.empty((most, len(firm)), dtype=np.int32)
     for k in range(most):
+        if k % GROUP == 0:
+            progress("distances", 0.1 + 0.5 * k / most)
         chosen[k] = nearest.argmax()
         row, paths = dijkstra(graph, indices=chosen[k], limit=limit, return_predecessors=True)
         rows[k], before[k] = row, paths

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -13,15 +14,17 @@ from vflatten_ros.core.errors import DisconnectedSurface, NotEnoughViews
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.one_view import flatten_one_view
+from vflatten_ros.core.parallel import Ahead, Once
 from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, finish, recognise
 from vflatten_ros.core.registration import ViewSurface, view_surface
 from vflatten_ros.core.rotation import (
     Surface,
     Unfolded,
-    look_for_ramps,
+    doubts,
+    fuse_views,
+    link_surface,
     turn_parts,
     unfold_surface,
-    whole_surface,
 )
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
@@ -116,11 +119,13 @@ def _rotation(
     """The automatic method: all views of a rotation."""
     unfolded, found = _likeliest(views, prepared, tuple(templates), config, progress)
     badness = _badness((unfolded, found))
-    for _ in range(TURNS if found.category != UNKNOWN else 0):
+    for turn in range(TURNS if found.category != UNKNOWN else 0):
+        progress("parts", turn / TURNS)
         fit = found.fits[found.category]
         rest = place(fit.template, fit.pose, fit.template.at_rest(fit.state))[0]
         k = fit.template.vertices
         unfolded = turn_parts(unfolded, fit.points()[:k], rest[:k], config.rotation)
+        progress("parts", (turn + 0.6) / TURNS)
         found = _refitted(unfolded, found, tuple(templates), config)
     none = np.zeros(0)
     notices = unfolded.notices
@@ -145,19 +150,34 @@ def _likeliest(
     config: Config,
     progress: Progress,
 ) -> tuple[Unfolded, Recognition]:
-    """The surface with and without doubtful places, whichever makes the better item."""
-    surface = whole_surface(views, config.rotation, progress, prepared)
+    """The surface with and without doubtful places, whichever makes the better item.
+
+    Most items need two tries, so two are made at once, and a result that is not needed is dropped.
+    """
+    fused = fuse_views(views, config.rotation, progress, prepared)
+    linked = Once(partial(link_surface, fused, config.rotation))
+    looked = Once(partial(doubts, fused, config.rotation))
+
+    def laid(doubt: float, progress: Progress) -> tuple[Unfolded, Recognition]:
+        ramps = looked(progress) if np.isfinite(doubt) else None
+        surface = linked(progress)
+        surface = surface if ramps is None else replace(surface, doubt=ramps)
+        return _recognised_as(surface, doubt, templates, config, progress)
+
     tries: list[tuple[Unfolded, Recognition]] = []
     failures: list[DisconnectedSurface] = []
-    for doubt, enough in zip(DOUBTS, (-np.inf, *ENOUGH), strict=True):
-        if tries and min(map(_badness, tries)) < enough:
-            break
-        if np.isfinite(doubt) and not surface.doubt.any():
-            surface = look_for_ramps(surface, config.rotation, progress)
-        try:
-            tries.append(_recognised_as(surface, doubt, templates, config, progress))
-        except DisconnectedSurface as error:
-            failures.append(error)
+    number, needed = 0, len(DOUBTS)
+    with Ahead([partial(laid, doubt) for doubt in DOUBTS]) as ahead:
+        while number < needed:
+            try:
+                tries.append(ahead.result(number, progress))
+            except DisconnectedSurface as error:
+                failures.append(error)
+            number += 1
+            best = min(map(_badness, tries), default=np.inf)
+            later = range(number, len(DOUBTS))
+            needed = next((k for k in later if best < ENOUGH[k - 1]), len(DOUBTS))
+            ahead.drop(needed)
     if not tries:
         raise failures[0]
     return min(tries, key=_badness)
@@ -171,8 +191,8 @@ def _recognised_as(
     progress: Progress,
 ) -> tuple[Unfolded, Recognition]:
     unfolded = unfold_surface(surface, doubt, config.rotation, progress)
-    progress("recognition", 0.0)
-    return unfolded, recognise(unfolded.outline, unfolded.points, templates, config.recognition)
+    outline, points = unfolded.outline, unfolded.points
+    return unfolded, recognise(outline, points, templates, config.recognition, progress)
 
 
 def _badness(tried: tuple[Unfolded, Recognition]) -> float:
@@ -197,10 +217,10 @@ def _described(
     progress: Progress,
 ) -> FlatGarment:
     """Category, sizes and places of a flattened item."""
-    progress("recognition", 0.0)
     if settled is not None:
         recognition = settled
     else:
+        progress("recognition", 0.0)
         flattened, recognition = _recognised(flattened, tuple(templates), config, progress)
     points, outline = flattened.points, flattened.outline
     progress("measurement", 0.0)

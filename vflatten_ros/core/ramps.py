@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.geometry import tangents
-from vflatten_ros.core.values import Bool, Float, Int
+from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 RING_M = (0.007, 0.014)  # cloth on both sides of a sample: beyond what one fit averages
 RING_HEIGHT_M = 0.006
@@ -27,7 +27,12 @@ CHUNK = 1024  # samples at a time, so that they stay in the cache
 
 
 def ramps(
-    xyz: Float, normal: Float, points: Float, normals: Float, config: RotationConfig
+    xyz: Float,
+    normal: Float,
+    points: Float,
+    normals: Float,
+    config: RotationConfig,
+    progress: Progress = no_progress,
 ) -> Float:
     """How much each sample looks like a ramp between two layers.
 
@@ -37,6 +42,8 @@ def ramps(
         Samples and their outward normals.
     points, normals : ndarray of shape (m, 3)
         Registered points of all views and their outward normals, same frame.
+    config : RotationConfig
+    progress : Progress
 
     Returns
     -------
@@ -44,11 +51,13 @@ def ramps(
         Height of the step (m) times tilt (rad), in units of rotation.ramp: paths should not pass
         through samples of more than 1.
     """
+    progress("ramps", 0.0)
     tilt = _tilt(xyz, normal)
     steep = np.flatnonzero(tilt * STEP_HEIGHT_M > config.ramp)
     tree = cKDTree(points[::2], balanced_tree=False, compact_nodes=False)
     step = np.zeros(len(xyz))
     for start in range(0, len(steep), CHUNK):
+        progress("ramps", 0.4 + 0.6 * start / len(steep))
         some = steep[start : start + CHUNK]
         step[some] = _step(xyz[some], normal[some], points[::2], normals[::2], tree)
     found: Float = step * tilt / config.ramp

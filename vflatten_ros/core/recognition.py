@@ -23,7 +23,7 @@ from vflatten_ros.core.template_fit import (
     starts,
 )
 from vflatten_ros.core.templates import Float, Template
-from vflatten_ros.core.values import Bool, FlatPoints, Outline
+from vflatten_ros.core.values import Bool, FlatPoints, Outline, Progress, no_progress
 
 UNKNOWN = "unknown"
 BEST = 5  # hypotheses of a category that are refined to the end
@@ -53,6 +53,7 @@ def recognise(
     points: FlatPoints,
     templates: tuple[Template, ...],
     config: RecognitionConfig,
+    progress: Progress = no_progress,
 ) -> Recognition:
     """Compare a flattened item with every category.
 
@@ -65,6 +66,7 @@ def recognise(
     templates : tuple of Template
         Categories to choose from.
     config : RecognitionConfig
+    progress : Progress
 
     Returns
     -------
@@ -77,9 +79,10 @@ def recognise(
     """
     if not templates:
         raise InvalidInput("recognise: no categories to choose from; see config/categories")
+    progress("recognition", 0.0)
     evidence = evidence_from(outline, points, config)
     scores = model_image_scores(evidence.outline, templates, config.decay, config.model_rotations)
-    fits = fit_templates(templates, evidence, config)
+    fits = fit_templates(templates, evidence, config, progress)
     probabilities = _probabilities(fits, evidence, config)
     category = max(probabilities, key=lambda name: probabilities[name])
     known = {name: p for name, p in probabilities.items() if name != UNKNOWN}
@@ -103,13 +106,20 @@ def fit_template(template: Template, evidence: Evidence, config: RecognitionConf
 
 
 def fit_templates(
-    templates: tuple[Template, ...], evidence: Evidence, config: RecognitionConfig
+    templates: tuple[Template, ...],
+    evidence: Evidence,
+    config: RecognitionConfig,
+    progress: Progress = no_progress,
 ) -> dict[str, Fit]:
     """The best pose and cut of every category; those that turn out hopeless with less effort."""
-    coarse = {t.category: _coarse(t, evidence.thinned(), config) for t in templates}
+    coarse = {}
+    for done, template in enumerate(templates):
+        progress("recognition", 0.2 + 0.4 * done / len(templates))
+        coarse[template.category] = _coarse(template, evidence.thinned(), config)
     least = min(float(energy[0]) for _, _, energy in coarse.values())
     fits = {}
-    for template in templates:
+    for done, template in enumerate(templates):
+        progress("recognition", 0.6 + 0.4 * done / len(templates))
         pose, state, energy = coarse[template.category]
         few = 1 if energy[0] > least + HOPELESS else BEST
         pose, state, energy = refine(template, evidence, pose[:few], state[:few], FINE)

@@ -48,15 +48,24 @@ CELL_M = 0.002  # of the image whose contour is the outline
 
 
 @dataclass(frozen=True, eq=False)
+class Fused:
+    """Samples of the whole visible surface."""
+
+    samples: Samples
+    points: Float  # (m, 3) registered points of all views that the samples were fitted to
+    normals: Float  # (m, 3)
+    view_id: Int  # (n,) of the measured point nearest to each sample
+    pixel: Int  # (n, 2)
+
+
+@dataclass(frozen=True, eq=False)
 class Surface:
     """Samples of the whole visible surface, linked."""
 
     samples: Samples
     links: Links
     edge: Int  # (n,) of sheet_edges
-    doubt: Float  # (n,) above 1: may be a ramp between two layers; 0 before look_for_ramps
-    points: Float  # (m, 3) registered points of all views that the samples were fitted to
-    normals: Float  # (m, 3)
+    doubt: Float  # (n,) above 1: may be a ramp between two layers; 0 where nobody looked
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
 
@@ -93,16 +102,17 @@ def unfold_surface(
     DisconnectedSurface
     """
     progress("join", 0.0)
-    passable, links = _joined(surface, doubt, config)
-    progress("distances", 0.0)
+    passable, links = _joined(surface, doubt, config, progress)
     samples = surface.samples
-    distances = surface_distances(samples.xyz, samples.normal, links, passable, config)
+    distances = surface_distances(samples.xyz, samples.normal, links, passable, config, progress)
     plane = unfold(distances.bound_m, distances.same_sheet, config, progress)
     progress("outline", 0.0)
     return _unfolded(surface, distances, plane, config)
 
 
-def _joined(surface: Surface, doubt: float, config: RotationConfig) -> tuple[Bool, Links]:
+def _joined(
+    surface: Surface, doubt: float, config: RotationConfig, progress: Progress
+) -> tuple[Bool, Links]:
     """Samples to go through and links to go along, with the pieces of the surface joined."""
     samples, links = surface.samples, surface.links
     # noisy or sparse points look like steps anywhere
@@ -111,12 +121,18 @@ def _joined(surface: Surface, doubt: float, config: RotationConfig) -> tuple[Boo
     )
     keep = links.doubt < doubt
     least = int(config.piece * len(samples.xyz))
-    for _ in range(MOST_JOINS):
+
+    def joining(_: str, fraction: float) -> None:
+        progress("join", (done + 0.5 * fraction) / MOST_JOINS)
+
+    for done in range(MOST_JOINS):
+        progress("join", done / MOST_JOINS)
         found = largest_pieces(links.part(keep), passable, least)
         if len(found) < 2:
             break
         ties = find_ties(links, *found[:2])
-        ends = [_laid_flat(surface, links.part(keep), piece, config) for piece in found[:2]]
+        rest = links.part(keep)
+        ends = [_laid_flat(surface, rest, piece, config, joining) for piece in found[:2]]
         one, other = ends[0][ties.one], ends[1][ties.other]
         placed = np.flatnonzero(np.isfinite(one).all(1) & np.isfinite(other).all(1))
         met = placed[agreeing(one[placed], other[placed], ties.length_m[placed])]
@@ -128,11 +144,14 @@ def _joined(surface: Surface, doubt: float, config: RotationConfig) -> tuple[Boo
     return passable, links.part(keep)
 
 
-def _laid_flat(surface: Surface, links: Links, piece: Bool, config: RotationConfig) -> Float:
+def _laid_flat(
+    surface: Surface, links: Links, piece: Bool, config: RotationConfig, progress: Progress
+) -> Float:
     """(n, 2) places of the samples of one piece, roughly; NaN elsewhere."""
     rough = replace(config, landmarks=ROUGH, unfold_rounds=ROUGH_ROUNDS)
-    distances = surface_distances(surface.samples.xyz, surface.samples.normal, links, piece, rough)
-    plane = unfold(distances.bound_m, distances.same_sheet, rough)
+    xyz, normal = surface.samples.xyz, surface.samples.normal
+    distances = surface_distances(xyz, normal, links, piece, rough, progress)
+    plane = unfold(distances.bound_m, distances.same_sheet, rough, progress)
     uv = place_samples(distances.around, distances.around_m, distances.around_sheet, plane)[0]
     return np.where(distances.inside[:, None], uv, np.nan)
 
@@ -151,13 +170,13 @@ def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationCo
     return _unfolded(unfolded.surface, distances, plane, config)
 
 
-def whole_surface(
+def fuse_views(
     views: Sequence[View],
     config: RotationConfig,
     progress: Progress = no_progress,
     prepared: Mapping[int, ViewSurface] | None = None,
-) -> Surface:
-    """Register and fuse the views, and link the samples.
+) -> Fused:
+    """Register and fuse the views.
 
     Parameters
     ----------
@@ -185,27 +204,30 @@ def whole_surface(
     view = np.concatenate([np.full(len(s.points), k) for k, s in enumerate(surfaces)])
     row = np.concatenate([s.index for s in surfaces])
     samples = fuse(points, normals, view, config, progress)
-    progress("link", 0.0)
-    links = link_samples(samples.xyz, samples.normal, config)
-    edge = _edges(samples, links, config)
     of_view = view[samples.source]
     pixel = np.zeros((len(of_view), 2), dtype=np.int64)
     for k, each in enumerate(views):
         mine = of_view == k
         pixel[mine] = each.pixel[row[samples.source[mine]]]
     ids = np.array([each.view_id for each in views], dtype=np.int64)
+    return Fused(samples, points, normals, ids[of_view], pixel)
+
+
+def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Surface:
+    """Link the samples, and find where their sheets end."""
+    progress("link", 0.0)
+    samples = fused.samples
+    links = link_samples(samples.xyz, samples.normal, config)
+    progress("link", 0.7)
+    edge = _edges(samples, links, config)
     doubt = np.zeros(len(samples.xyz))
-    return Surface(samples, links, edge, doubt, points, normals, ids[of_view], pixel)
+    return Surface(samples, links, edge, doubt, fused.view_id, fused.pixel)
 
 
-def look_for_ramps(
-    surface: Surface, config: RotationConfig, progress: Progress = no_progress
-) -> Surface:
-    """The same surface, with the samples in doubt that may join two layers."""
-    progress("ramps", 0.0)
-    samples = surface.samples
-    doubt = ramps(samples.xyz, samples.normal, surface.points, surface.normals, config)
-    return replace(surface, doubt=doubt)
+def doubts(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Float:
+    """How likely each sample (n,) joins two layers: above 1, it may."""
+    samples = fused.samples
+    return ramps(samples.xyz, samples.normal, fused.points, fused.normals, config, progress)
 
 
 def _edges(samples: Samples, links: Links, config: RotationConfig) -> Int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,11 @@ from typing import Any
 from mcap.records import Channel, Message, Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from vflatten_ros.core.buffer import ViewBuffer
+from vflatten_ros.core.buffer import Event, ViewAdded, ViewBuffer, ViewReplaced
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import InvalidCloud, InvalidRecording
 from vflatten_ros.core.pointcloud import PointField, decode_cloud
-from vflatten_ros.core.values import Calibration, Cloud, Progress, no_progress
+from vflatten_ros.core.values import Calibration, Cloud, Progress, View, no_progress
 from vflatten_ros.mcap_files import (
     BROKEN,
     Topic,
@@ -141,8 +141,18 @@ def gather_views(
     calibration: Calibration,
     config: Config,
     progress: Progress = no_progress,
+    on_view: Callable[[View], None] = lambda view: None,
 ) -> ViewBuffer:
     """Run a whole recording through a view buffer.
+
+    Parameters
+    ----------
+    recording : Recording
+    calibration : Calibration
+    config : Config
+    progress : Progress
+    on_view : callable
+        Told every view as it comes, those included that give way to better ones later.
 
     Raises
     ------
@@ -152,21 +162,31 @@ def gather_views(
     buffer = ViewBuffer(calibration, config)
     clouds = 0
     for message in recording.messages():
-        if isinstance(message, RecordedJoints):
-            buffer.add_joint(message.stamp_ns, message.names, message.positions, message.log_ns)
-            continue
-        try:
-            cloud = message.decode()
-        except InvalidCloud as error:
-            buffer.reject_cloud(str(error), message.log_ns)
-        else:
-            buffer.add_cloud(cloud, message.log_ns)
-        clouds += 1
-        progress("views", min(clouds / recording.clouds, 1.0) if recording.clouds else 0.0)
-    buffer.finish()
+        _tell(buffer, _take(buffer, message), on_view)
+        if isinstance(message, RecordedCloud):
+            clouds += 1
+            progress("views", min(clouds / recording.clouds, 1.0) if recording.clouds else 0.0)
+    _tell(buffer, buffer.finish(), on_view)
     _check_views(recording, calibration, buffer)
     progress("views", 1.0)
     return buffer
+
+
+def _take(buffer: ViewBuffer, message: RecordedCloud | RecordedJoints) -> tuple[Event, ...]:
+    at = message.log_ns
+    if isinstance(message, RecordedJoints):
+        return buffer.add_joint(message.stamp_ns, message.names, message.positions, at)
+    try:
+        return buffer.add_cloud(message.decode(), at)
+    except InvalidCloud as error:
+        return buffer.reject_cloud(str(error), at)
+
+
+def _tell(buffer: ViewBuffer, events: Sequence[Event], on_view: Callable[[View], None]) -> None:
+    new = {e.view_id for e in events if isinstance(e, ViewAdded | ViewReplaced)}
+    for view in buffer.views() if new else ():
+        if view.view_id in new:
+            on_view(view)
 
 
 def cloud_from(message: Any) -> Cloud:

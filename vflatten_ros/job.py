@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
@@ -43,20 +44,26 @@ class Flattening:
 
     def prepare(self, view: View, config: Config) -> None:
         """What flattening needs of a view whatever the others are."""
-        self._of(view, config)
+        from vflatten_ros.core.pipeline import prepare_view
+
+        if self._of(view, config) is None:
+            self._prepared[view] = (config.rotation, prepare_view(view, config))
 
     def flatten(
         self, views: Sequence[View], job: Job, progress: Progress
     ) -> tuple[FlatGarment, Mapping[str, bytes]]:
         """Flatten, and serialize the messages of the outputs by the last part of their topic."""
-        from vflatten_ros.core.pipeline import flatten_garment  # not needed by the node's process
+        # not needed by the node's process
+        from vflatten_ros.core.parallel import mapped
+        from vflatten_ros.core.pipeline import flatten_garment, prepare_view
 
-        prepared = {}
-        for number, view in enumerate(views):
-            progress("surface", number / len(views))
-            surface = self._of(view, job.config)
-            if surface is not None:
-                prepared[view.view_id] = surface
+        progress("surface", 0.0)
+        missing = [view for view in views if self._of(view, job.config) is None]
+        for number, surface in enumerate(mapped(partial(prepare_view, config=job.config), missing)):
+            self._prepared[missing[number]] = (job.config.rotation, surface)
+            progress("surface", number / len(missing))
+        of_views = [(view.view_id, self._of(view, job.config)) for view in views]
+        prepared = {view_id: surface for view_id, surface in of_views if surface is not None}
         garment = flatten_garment(
             views, job.correspondences, self._templates, job.config, progress, prepared
         )
@@ -64,13 +71,9 @@ class Flattening:
         return garment, serialized(garment, views)
 
     def _of(self, view: View, config: Config) -> ViewSurface | None:
-        from vflatten_ros.core.pipeline import prepare_view
-
+        """A view as it was prepared with these settings."""
         settings, surface = self._prepared.get(view, (None, None))
-        if settings != config.rotation or surface is None:
-            surface = prepare_view(view, config)
-            self._prepared[view] = (config.rotation, surface)
-        return surface
+        return surface if settings == config.rotation else None
 
 
 def serialized(garment: FlatGarment, views: Sequence[View]) -> dict[str, bytes]:

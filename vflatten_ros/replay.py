@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 from vflatten_ros.bag import Recording, gather_views, open_recording
 from vflatten_ros.categories import load_templates
@@ -18,7 +20,9 @@ from vflatten_ros.core.errors import (
     InvalidRecording,
     NotEnoughViews,
 )
-from vflatten_ros.core.pipeline import flatten_garment
+from vflatten_ros.core.parallel import THREADS
+from vflatten_ros.core.pipeline import flatten_garment, prepare_view
+from vflatten_ros.core.registration import ViewSurface
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import Correspondence, FlatGarment, Progress, View, no_progress
 from vflatten_ros.files import calibration_beside, load_calibration, load_protocol
@@ -84,18 +88,21 @@ def replay_recording(
     chosen, pairs = load_protocol(protocol) if protocol else ((), ())
     wanted = tuple(view_ids) or chosen
     recording = open_recording(path, cloud_topic, joint_topic)
-    buffer = gather_views(recording, rig, _keeping_all(config) if wanted else config, progress)
-    for text in recording.warnings:
-        warn(text)
-    state = buffer.state()
-    views = _select(buffer.views(), wanted, recording)
-    if config.method == "rotation" and len(views) < 2:
-        raise NotEnoughViews(
-            f"{path}: method rotation needs two views or more, got {len(views)}; use more of them, "
-            "or flatten what one view shows with --method kita2019"
-        )
-    kept = _check_pairs(pairs, views, protocol, warn)
-    garment = flatten_garment(views, kept, templates, config, progress)
+    with _Preparation(config, wanted) as preparation:
+        gathering = _keeping_all(config) if wanted else config
+        buffer = gather_views(recording, rig, gathering, progress, preparation.begin)
+        for text in recording.warnings:
+            warn(text)
+        state = buffer.state()
+        views = _select(buffer.views(), wanted, recording)
+        if config.method == "rotation" and len(views) < 2:
+            raise NotEnoughViews(
+                f"{path}: method rotation needs two views or more, got {len(views)}; use more of "
+                "them, or flatten what one view shows with --method kita2019"
+            )
+        kept = _check_pairs(pairs, views, protocol, warn)
+        prepared = preparation.of(views, progress)
+    garment = flatten_garment(views, kept, templates, config, progress, prepared)
     return Replayed(
         garment=garment,
         views=views,
@@ -142,6 +149,36 @@ def flatten_file(
         raise type(error)(f"{path}: {error}") from error
     garment = flatten_garment((view,), (), templates, config, progress)
     return Replayed(garment, (view,), templates, str(path), clouds=1, drops={})
+
+
+class _Preparation:
+    """Prepares views on other threads while the next are read. A context."""
+
+    def __init__(self, config: Config, wanted: Sequence[int]) -> None:
+        self._config, self._wanted = config, frozenset(wanted)
+        self._pool = ThreadPoolExecutor(THREADS)
+        # goes with its view, as when a new item begins
+        self._begun: WeakKeyDictionary[View, Future[ViewSurface | None]] = WeakKeyDictionary()
+
+    def __enter__(self) -> _Preparation:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def begin(self, view: View) -> None:
+        if not self._wanted or view.view_id in self._wanted:
+            self._begun[view] = self._pool.submit(prepare_view, view, self._config)
+
+    def of(self, views: Sequence[View], progress: Progress) -> dict[int, ViewSurface]:
+        """What flatten_garment takes; raises what preparing one of the views raised."""
+        prepared = {}
+        for number, view in enumerate(views):
+            progress("surface", number / len(views))
+            surface = self._begun[view].result()
+            if surface is not None:
+                prepared[view.view_id] = surface
+        return prepared
 
 
 def _keeping_all(config: Config) -> Config:

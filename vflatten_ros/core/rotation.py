@@ -19,6 +19,7 @@ from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.fusion import Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.joining import agreeing, find_ties, largest_pieces, near_paths
+from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.ramps import ramps
 from vflatten_ros.core.registration import ViewSurface, register_views, view_surface
 from vflatten_ros.core.sheets import Links, link_samples, sheet_edges
@@ -192,24 +193,29 @@ def fuse_views(
     NotEnoughViews
     """
     done = prepared or {}
-    surfaces = []
-    for k, view in enumerate(views):
-        progress("surface", k / len(views))
-        surfaces.append(done[view.view_id] if view.view_id in done else view_surface(view, config))
+
+    def surface(view: View) -> ViewSurface:
+        return done[view.view_id] if view.view_id in done else view_surface(view, config)
+
+    progress("surface", 0.0)
+    surfaces: list[ViewSurface] = []
+    for each in mapped(surface, views):
+        surfaces.append(each)
+        progress("surface", len(surfaces) / len(views))
     poses = register_views(surfaces, config, progress)
     moved = zip(poses, surfaces, strict=True)
     points = np.vstack([transform_points(pose, s.points) for pose, s in moved])
     moved = zip(poses, surfaces, strict=True)
     normals = np.vstack([transform_directions(pose, s.normals) for pose, s in moved])
-    view = np.concatenate([np.full(len(s.points), k) for k, s in enumerate(surfaces)])
+    of_point = np.concatenate([np.full(len(s.points), k) for k, s in enumerate(surfaces)])
     row = np.concatenate([s.index for s in surfaces])
-    samples = fuse(points, normals, view, config, progress)
-    of_view = view[samples.source]
+    samples = fuse(points, normals, of_point, config, progress)
+    of_view = of_point[samples.source]
     pixel = np.zeros((len(of_view), 2), dtype=np.int64)
-    for k, each in enumerate(views):
+    for k, view in enumerate(views):
         mine = of_view == k
-        pixel[mine] = each.pixel[row[samples.source[mine]]]
-    ids = np.array([each.view_id for each in views], dtype=np.int64)
+        pixel[mine] = view.pixel[row[samples.source[mine]]]
+    ids = np.array([view.view_id for view in views], dtype=np.int64)
     return Fused(samples, points, normals, ids[of_view], pixel)
 
 

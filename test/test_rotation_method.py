@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from recordings import BAGS
 
-from vflatten_ros.core import pipeline
+from vflatten_ros.core import parallel, pipeline
 from vflatten_ros.core.config import Config
 from vflatten_ros.replay import replay_recording
+from vflatten_ros.results import garment_result, json_text
 
 ALL_VIEWS = dataclasses.replace(Config(), method="rotation")
 
@@ -71,3 +72,12 @@ def test_a_quarter_of_a_rotation_is_not_trusted_or_says_what_was_not_seen():
     garment = replay_recording(BAGS / "LS1_1", ALL_VIEWS, view_ids=range(6)).garment
     codes = {notice.code for notice in garment.notices}
     assert codes & {"untrusted", "width_unseen", "length_unseen"}
+
+
+@pytest.mark.slow
+def test_the_same_bytes_on_one_thread_and_without_views_prepared_before(monkeypatch):
+    replayed = replay_recording(BAGS / "LS1_1", ALL_VIEWS, view_ids=range(0, 24, 2))
+    first = json_text(garment_result(replayed.garment, replayed.views))
+    monkeypatch.setattr(parallel, "THREADS", 1)
+    again = pipeline.flatten_garment(replayed.views, (), replayed.templates, ALL_VIEWS)
+    assert json_text(garment_result(again, replayed.views)) == first

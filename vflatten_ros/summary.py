@@ -8,6 +8,13 @@ from vflatten_ros.core.buffer import DROP_REASONS
 from vflatten_ros.core.values import FlatGarment, Measurement
 from vflatten_ros.replay import Replayed
 
+BESIDE_THE_METHOD = (
+    "open",
+    "views",
+    "mcap",
+    "figures",
+)  # before the last view, or after the result
+
 
 def summary(replayed: Replayed, seconds: Mapping[str, float]) -> str:
     """Category, sizes, what was used, what was dropped and why, wall time per stage."""
@@ -71,7 +78,9 @@ def _ranges(ids: Sequence[int]) -> str:
 
 def _times(seconds: Mapping[str, float]) -> str:
     shown = [f"{stage} {value:.2f}" for stage, value in seconds.items() if value >= 0.005]
-    return f"{sum(seconds.values()):.2f} s: {', '.join(shown)}"
+    after = sum(value for stage, value in seconds.items() if stage not in BESIDE_THE_METHOD)
+    total = sum(seconds.values())
+    return f"{total:.2f} s, {after:.2f} s after the last view: {', '.join(shown)}"
 
 
 def _merged(rows: Iterable[tuple[str, str]]) -> Iterator[tuple[str, str]]:

@@ -1,0 +1,128 @@
+#!/usr/bin/env python3
+"""Time from the last view to the result of the automatic method, for each recording.
+
+    source env.sh
+    python3 benchmarks/last_view.py RECORDING [RECORDING ...] [--rounds 3] [--docs]
+
+Views are prepared before, as they are while the wrist turns. Wall time, the best of some rounds;
+CPU time beside it, since two threads share the work. `--docs` writes the table of
+docs/benchmarks.md.
+"""
+
+# ruff: noqa: E402  (threads must be limited before numpy is imported)
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+from vflatten_ros import threads
+
+threads.use_one()
+
+import argparse
+import os
+import resource
+import time
+from dataclasses import dataclass, field
+
+from report import row, table_head, write_part
+
+from vflatten_ros.bag import gather_views, open_recording
+from vflatten_ros.categories import load_templates
+from vflatten_ros.core.config import Config
+from vflatten_ros.core.pipeline import flatten_garment, prepare_view
+from vflatten_ros.files import calibration_beside, load_calibration
+from vflatten_ros.progress import Stages
+
+PAGE = ROOT / "docs" / "benchmarks.md"
+ABOUT = """
+Written by `python3 benchmarks/last_view.py RECORDING ... --docs`: wall seconds of `rotation` after
+the views are prepared, the best of some rounds. Where two tries are made at once, a stage's time is
+that of the try which was waited for.
+"""
+TOGETHER = {
+    "register, fuse": ("surface", "register", "fuse"),
+    "link, ramps": ("link", "ramps"),
+    "join, distances, unfold": ("join", "distances", "unfold"),
+    "outline, recognition": ("outline", "recognition"),
+    "parts, measurement": ("parts", "measurement"),
+}
+
+
+class Watched(Stages):
+    """Times the stages, and the longest time without a report."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gap_s, self._last = 0.0, time.perf_counter()
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        now = time.perf_counter()
+        self.gap_s, self._last = max(self.gap_s, now - self._last), now
+        super().__call__(stage, fraction)
+
+
+@dataclass
+class Run:
+    """One flattening after the last view."""
+
+    wall_s: float
+    cpu_s: float
+    gap_s: float
+    category: str
+    stages: dict[str, float] = field(default_factory=dict)
+
+
+def measure(folder: Path, rounds: int) -> tuple[Run, float]:
+    """The fastest of some runs, and the time to prepare a view."""
+    config, templates = Config(), load_templates()
+    rig = load_calibration(calibration_beside(folder))
+    views = gather_views(open_recording(folder), rig, config).views()
+    begin = time.perf_counter()
+    surfaces = {view.view_id: prepare_view(view, config) for view in views}
+    each = (time.perf_counter() - begin) / len(views)
+    prepared = {view_id: s for view_id, s in surfaces.items() if s is not None}
+    runs = []
+    for _ in range(rounds):
+        wall, cpu, stages = time.perf_counter(), time.process_time(), Watched()
+        garment = flatten_garment(views, (), templates, config, stages, prepared)
+        stages.stop()
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        runs.append(Run(wall, cpu, stages.gap_s, garment.category, stages.seconds))
+    return min(runs, key=lambda run: run.wall_s), each
+
+
+def main() -> int:
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("recordings", type=Path, nargs="+")
+    options.add_argument("--rounds", type=int, default=3)
+    options.add_argument("--docs", action="store_true", help="write docs/benchmarks.md")
+    args = options.parse_args()
+    lines = table_head(
+        "", ["recording", "result", *TOGETHER, "all", "CPU", "longest without a report"]
+    )[-2:]
+    print("\n".join(lines))
+    prepare = []
+    for folder in args.recordings:
+        run, each = measure(folder, args.rounds)
+        prepare.append(each)
+        shares = [sum(run.stages.get(s, 0.0) for s in stages) for stages in TOGETHER.values()]
+        times = [f"{s:.2f}" for s in (*shares, run.wall_s, run.cpu_s, run.gap_s)]
+        lines.append(row([folder.name, run.category, *times]))
+        print(lines[-1], flush=True)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    about = (
+        f"{os.cpu_count()} cores, load average {os.getloadavg()[0]:.1f}; preparing a view as it "
+        f"arrives takes {max(prepare):.2f} s at most; most memory {peak:.0f} MB."
+    )
+    print(about)
+    if args.docs:
+        write_part(PAGE, "After the last view", "\n".join([ABOUT, *lines, "", about]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -15,8 +15,8 @@ CANCEL_GRACE_S = 0.2  # then the process is ended
 # Seconds of each stage; only their shares count, and only until the first flattening is done.
 FIRST_GUESS: Mapping[str, Mapping[str, float]] = {
     "kita2019": {
-        "surface": 0.5, "integration": 0.1, "geodesics": 0.7, "flattening": 0.5, "outline": 0.1,
-        "recognition": 0.3, "measurement": 0.1, "messages": 0.1,
+        "surface": 0.5, "register": 0.0, "choose": 0.0, "integration": 0.1, "geodesics": 0.7,
+        "flattening": 0.5, "outline": 0.1, "recognition": 0.3, "measurement": 0.1, "messages": 0.1,
     },
     "rotation": {
         "surface": 0.1, "register": 0.3, "fuse": 0.5, "link": 0.4, "distances": 0.6, "unfold": 0.4,

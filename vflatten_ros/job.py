@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import Config, RotationConfig
+from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import FlatGarment, Progress, View
 from vflatten_ros.messages import fill, message_class
@@ -55,14 +57,16 @@ class Flattening:
         """Flatten, and serialize the messages of the outputs by the last part of their topic."""
         # not needed by the node's process
         from vflatten_ros.core.parallel import mapped
-        from vflatten_ros.core.pipeline import flatten_garment, prepare_view
+        from vflatten_ros.core.pipeline import flatten_garment
 
         progress("surface", 0.0)
-        missing = [view for view in views if self._of(view, job.config) is None]
-        for number, surface in enumerate(mapped(partial(prepare_view, config=job.config), missing)):
+        alone = job.config.method != "rotation" and (job.correspondences or len(views) < 2)
+        wanted = () if alone else views  # else two views are named
+        missing = [view for view in wanted if self._of(view, job.config) is None]
+        for number, surface in enumerate(mapped(partial(_prepared, config=job.config), missing)):
             self._prepared[missing[number]] = (job.config.rotation, surface)
             progress("surface", number / len(missing))
-        of_views = [(view.view_id, self._of(view, job.config)) for view in views]
+        of_views = [(view.view_id, self._of(view, job.config)) for view in wanted]
         prepared = {view_id: surface for view_id, surface in of_views if surface is not None}
         garment = flatten_garment(
             views, job.correspondences, self._templates, job.config, progress, prepared
@@ -74,6 +78,15 @@ class Flattening:
         """A view as it was prepared with these settings."""
         settings, surface = self._prepared.get(view, (None, None))
         return surface if settings == config.rotation else None
+
+
+def _prepared(view: View, config: Config) -> ViewSurface | None:
+    """None: the view shows hardly anything; the method says it, or does without."""
+    from vflatten_ros.core.pipeline import prepare_view
+
+    with suppress(NotEnoughViews):
+        return prepare_view(view, config)
+    return None
 
 
 def serialized(garment: FlatGarment, views: Sequence[View]) -> dict[str, bytes]:

@@ -305,6 +305,19 @@ class CorrespondenceConfig(Checked):
 
 
 @dataclass(frozen=True)
+class ViewsConfig(Checked):
+    """Choosing views."""
+
+    apart_deg: float = option(
+        150.0, "Two views farther apart are no pair for the two-view method, deg.",
+        low=10.0, high=180.0,
+    )  # fmt: skip
+    pairs: int = option(
+        6, "Most pairs of views that the two-view method tries by itself.", low=1, high=1000
+    )
+
+
+@dataclass(frozen=True)
 class FlatteningConfig(Checked):
     """Distances to plane (paper, section 2.2)."""
 
@@ -580,6 +593,7 @@ class Config:
     geodesics: GeodesicConfig = GeodesicConfig()
     integration: IntegrationConfig = IntegrationConfig()
     correspondences: CorrespondenceConfig = CorrespondenceConfig()
+    views: ViewsConfig = ViewsConfig()
     flattening: FlatteningConfig = FlatteningConfig()
     assembly: AssemblyConfig = AssemblyConfig()
     contour: ContourConfig = ContourConfig()

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.config import CorrespondenceConfig, RotationConfig
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.registration import ViewSurface, register_views
-from vflatten_ros.core.values import Correspondence, Float, Int, Notice, View
+from vflatten_ros.core.values import Correspondence, Float, Int, Notice, Progress, View, no_progress
 
 ALIKE = 0.9  # least cosine between the normals of one point in two views
 FACING = 0.35  # cosine towards a camera at which half is lost: pixels are sheared there
@@ -53,10 +53,14 @@ class Matches:
 
 
 def place_views(
-    views: Sequence[View], surfaces: Sequence[ViewSurface], config: RotationConfig
+    views: Sequence[View],
+    surfaces: Sequence[ViewSurface],
+    config: RotationConfig,
+    progress: Progress = no_progress,
 ) -> list[PlacedView]:
     """Register the views and bring their surfaces to one frame; by the wrist angle if only one."""
-    poses = register_views(surfaces, config) if len(surfaces) > 1 else [np.eye(4)]
+    several = len(surfaces) > 1
+    poses = register_views(surfaces, config, progress) if several else [np.eye(4)]
     found = zip(views, surfaces, poses, strict=True)
     return [place_view(view, surface, pose) for view, surface, pose in found]
 

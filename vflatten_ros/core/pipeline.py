@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from vflatten_ros.core.assembly import assemble
+from vflatten_ros.core.automatic_pair import fill_up, flatten_best_pair
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface, NotEnoughViews
 from vflatten_ros.core.measurement import measure
@@ -28,7 +29,7 @@ from vflatten_ros.core.rotation import (
 )
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
-from vflatten_ros.core.two_views import flatten_two_views
+from vflatten_ros.core.two_views import flatten_two_views, named_views
 from vflatten_ros.core.values import (
     Correspondence,
     FlatGarment,
@@ -40,6 +41,7 @@ from vflatten_ros.core.values import (
     no_progress,
 )
 
+MOST_JUDGED = 3  # corresponding points given, up to which others are found to judge them
 DOUBTS = (np.inf, 1.0, 0.6, 0.4)  # what is in greater doubt does not join the surface
 ENOUGH = (-0.5, 0.0, 0.0)  # badness below which no more than one, two, three are tried
 DOUBTFUL = 0.3  # badness above which the result is not to be trusted
@@ -48,15 +50,17 @@ LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more t
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 
 
-def prepare_view(view: View, config: Config) -> ViewSurface | None:
+def prepare_view(view: View, config: Config) -> ViewSurface:
     """What flattening needs of a view whatever the others are: do it as the view arrives.
+
+    'kita2019' needs it only where no corresponding points are given.
 
     Raises
     ------
     VFlattenError
         As flatten_garment would of this view.
     """
-    return view_surface(view, config.rotation) if config.method == "rotation" else None
+    return view_surface(view, config.rotation)
 
 
 def flatten_garment(
@@ -74,7 +78,8 @@ def flatten_garment(
     views : sequence of View
         Views of one item that hangs still; config.method says how many are needed.
     correspondences : sequence of Correspondence
-        Points of the cloth seen in two views; 'kita2019' needs two or more, 'rotation' none.
+        Points of the cloth seen in two views, as a person gives them. 'kita2019' uses the views
+        that they name; without any it chooses two views, and finds points, by itself.
     templates : sequence of Template
         Categories to choose from.
     config : Config
@@ -105,7 +110,19 @@ def _kita2019(
     """The paper's method: two views and a few corresponding points, or one view alone."""
     if len(views) == 1:
         return flatten_one_view(views[0], config, progress), None
-    return flatten_two_views(views, correspondences, config, progress), None
+
+    def judge(flattened: Flattened) -> tuple[Flattened, Recognition, float]:
+        placed, found = _recognised(flattened, tuple(templates), config, progress)
+        measured = measure(found, placed.outline, placed.points, config.measurement)
+        return placed, found, measured.quality
+
+    if correspondences:
+        named = named_views(views, correspondences)
+        # the more are given, the better they judge one another
+        more = () if len(correspondences) > MOST_JUDGED else fill_up(named, config, progress)
+        return flatten_two_views(named, correspondences, config, progress, more), None
+    best = flatten_best_pair(views, config, judge, progress, prepared)
+    return best.flattened, best.recognition
 
 
 def _rotation(

@@ -70,7 +70,7 @@ POINT_SIGMA_M = 0.002  # of a flattened point, whatever its stress
 MISFIT_M = 0.003  # of neighbours, beyond which they lose their say when unrolled
 SMALLEST = 0.05  # share of the main piece's samples that makes a piece worth placing
 FEWEST_PAIRS = 2  # that fix one view's place in the plane of the other
-JUDGED = 3  # points given that contradict one another cannot judge, if no more, which is wrong
+JUDGES = 3  # points given that agree need no others to tell whether they are right
 MOSTLY_LOOSE = 0.55  # share of the samples outside the main piece beyond which sizes are a guess
 
 
@@ -91,6 +91,7 @@ def flatten_two_views(
     correspondences: Sequence[Correspondence],
     config: Config,
     progress: Progress = no_progress,
+    found: Sequence[Correspondence] = (),
 ) -> Flattened:
     """Flatten the side of an item that two views show.
 
@@ -99,8 +100,11 @@ def flatten_two_views(
     views : sequence of View
         The two views, or more, of which the correspondences name two.
     correspondences : sequence of Correspondence
-        Two or more points of the cloth seen in both.
+        Points of the cloth seen in both, given by a person; two or more if none were found.
     config : Config
+    progress : Progress
+    found : sequence of Correspondence
+        Others of the same views, as in flatten_pair.
 
     Raises
     ------
@@ -111,18 +115,24 @@ def flatten_two_views(
     DisconnectedSurface
         Nothing joins the two views.
     """
-    if len(views) > 1 and len(correspondences) < FEWEST_PAIRS:
+    if len(views) > 1 and len(correspondences) + len(found) < FEWEST_PAIRS:
         raise InvalidCorrespondence(
             "the two-view method needs two corresponding points or more (the paper: three to "
             f"five), got {len(correspondences)}; give them with --protocol or by the service "
             "add_correspondences"
         )
-    first, second = named_views(views, correspondences)
+    first, second = named_views(views, [*correspondences, *found])
+    a, b = observed([first, second], config, progress)
+    return flatten_pair(a, b, correspondences, found, config, progress)
+
+
+def observed(views: Sequence[View], config: Config, progress: Progress) -> list[Observation]:
+    """What two views show, or one, or none."""
+    if not views:
+        return []
     with ThreadPoolExecutor(1) as other:  # numpy leaves the interpreter free for the second core
-        waiting = other.submit(observe, second, config, no_progress)
-        a = observe(first, config, progress)
-        b = waiting.result()
-    return flatten_pair(a, b, correspondences, (), config, progress)
+        waiting = [other.submit(observe, view, config, no_progress) for view in views[1:]]
+        return [observe(views[0], config, progress), *(w.result() for w in waiting)]
 
 
 def flatten_pair(
@@ -141,8 +151,8 @@ def flatten_pair(
     given : sequence of Correspondence
         Points that a person gave; those that agree are all used.
     found : sequence of Correspondence
-        Others, the best first. They fill up where fewer than two that agree were given, and help
-        to tell which is wrong where those that were given contradict one another.
+        Others, the best first. They fill up where fewer than two that agree were given, and tell
+        which is wrong where less than three were given or those contradict one another.
     config : Config
 
     Raises
@@ -164,11 +174,13 @@ def _corresponding(
 ) -> _Pair:
     own = _located(a, b, given, config)
     keep = consistent_pairs(own.points_a, own.points_b, config.integration)
-    if found and (keep.sum() < FEWEST_PAIRS or (not keep.all() and len(keep) <= JUDGED)):
+    if found and (len(keep) < JUDGES or not keep.all()):
         more = _located(a, b, found, config)
         more = more.part(np.flatnonzero(more.on_patches)[: config.correspondences.count])
         own = own.with_more(more)
         keep = consistent_pairs(own.points_a, own.points_b, config.integration)
+        if keep[: len(given)].sum() >= FEWEST_PAIRS:  # the others have judged, and are not needed
+            own, keep = own.part(np.arange(len(given))), keep[: len(given)]
     if keep.sum() < FEWEST_PAIRS:
         raise InvalidCorrespondence(
             f"the {len(keep)} corresponding points contradict one another: at most {keep.sum()} "

@@ -248,6 +248,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "category_uncertain": "two categories fit nearly as well",
     "solution_uncertain": "the item may lie otherwise, with another width or length",
     "correspondence_rejected": "a corresponding point contradicts the others",
+    "views_chosen": "which views the two-view method chose by itself",
     "high_stress": "the distances contradict each other more than noise explains",
     "truncated": "the item reaches the border of the image",
     "untrusted": "the result should not be used for sizes",

@@ -25,7 +25,7 @@ Float32 = NDArray[np.float32]
 PLACED_BY = 10  # landmarks that place a sample
 LEAST_INSIDE = 0.4  # of the samples in the largest piece
 FIRM_LINKS = 6  # links on the sheet that a landmark needs
-GROUP = 32  # landmarks whose paths are laid out together: bounds the memory
+GROUP = 16  # landmarks whose paths are laid out together: bounds the memory
 BLOCK = 512  # samples whose nearest landmarks are found together, so that they stay in the cache
 STRAIGHT_LEAST = 0.85  # a chain whose ends are nearer than this share of it went round something
 
@@ -57,38 +57,46 @@ class _Steps:
 class _Walk:
     """Shortest paths from landmarks, laid out to straighten them."""
 
-    rows: Float32  # (k, n) length of the paths
-    before: NDArray[np.int32]  # (k, n) sample before each on its path
+    paths: csr_matrix  # (k, n) their lengths, for the samples that are near
+    before: NDArray[np.int32]  # sample before each of those on its path, negative at the start
     chosen: Int  # (k,) where the paths start
     steps: _Steps
     rim_detour_m: float
 
     def lengths(self, landmark: Int, sample: Int) -> tuple[Float, Bool]:
         """Distances from landmarks to samples, and whether along one sheet and straight."""
-        straight, rims = self._straight(landmark, sample)
-        path = self.rows[landmark, sample] - self.rim_detour_m * rims
+        straight, path, rims = self._straight(landmark, sample)
+        path = path - self.rim_detour_m * rims
         usable = (rims == 0) & (straight > STRAIGHT_LEAST * path)
         moved = usable & (path > 0)
         stretch = float(np.median(path[moved] / straight[moved])) if moved.any() else 1.0
         return np.where(usable, straight, path / stretch), usable
 
-    def _straight(self, landmark: Int, sample: Int) -> tuple[Float, Int]:
-        """Distance between the laid out ends of all paths, and rims on the way."""
-        straight = np.empty(len(sample))
+    def _straight(self, landmark: Int, sample: Int) -> tuple[Float, Float, Int]:
+        """Distance between the laid out ends of paths, their lengths, and rims on the way."""
+        straight, path = np.empty(len(sample)), np.empty(len(sample))
         rims = np.empty(len(sample), dtype=np.int64)
         order = np.argsort(landmark.astype(np.int16), kind="stable")
         firsts = range(0, len(self.chosen), GROUP)
         ends = np.searchsorted(landmark[order], [*firsts, len(self.chosen)])
         for first, low, high in zip(firsts, ends[:-1], ends[1:], strict=True):
             some = order[low:high]
-            straight[some], rims[some] = self._straight_from(first, landmark[some], sample[some])
-        return straight, rims
+            straight[some], path[some], rims[some] = self._straight_from(
+                first, landmark[some], sample[some]
+            )
+        return straight, path, rims
 
-    def _straight_from(self, first: int, landmark: Int, sample: Int) -> tuple[Float, Int]:
+    def _straight_from(self, first: int, landmark: Int, sample: Int) -> tuple[Float, Float32, Int]:
         """The same from GROUP landmarks, each path laid out from that of the sample before it."""
-        count = self.rows.shape[1]
-        before = self.before[first : first + GROUP].ravel()
-        home = np.arange(len(before) // count) * count + self.chosen[first : first + GROUP]
+        count = self.paths.shape[1]
+        ends = self.paths.indptr[first : first + GROUP + 1]
+        known = slice(ends[0], ends[-1])
+        row = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
+        known_at = row * count + self.paths.indices[known]
+        path = np.empty((len(ends) - 1) * count, dtype=np.float32)
+        before = np.empty(len(path), dtype=np.int32)
+        path[known_at], before[known_at] = self.paths.data[known], self.before[known]
+        home = np.arange(len(ends) - 1) * count + self.chosen[first : first + GROUP]
         wanted = (landmark - first) * count + sample
         needed = np.zeros(len(before), dtype=bool)
         needed[wanted] = needed[home] = True
@@ -114,7 +122,7 @@ class _Walk:
             rims[at] = rim[now] + rims[back]
             needed[at] = False
             waiting = waiting[~ready]
-        return np.abs(total[wanted]), rims[wanted]
+        return np.abs(total[wanted]), path[wanted], rims[wanted]
 
 
 def surface_distances(
@@ -163,17 +171,21 @@ def surface_distances(
     degree = np.bincount(np.r_[a[both], b[both]], minlength=count)
     firm = inside & (degree >= FIRM_LINKS)
     inside[end[inside[start]]] = True
-    chosen, rows, before = _landmarks(graph, firm, config, progress)
-    near = np.isfinite(rows[:, chosen]) & ~np.eye(len(chosen), dtype=bool)
-    source, target = np.nonzero(near)
+    chosen, paths, before = _landmarks(graph, firm, config, progress)
+    rank = np.full(count, -1)
+    rank[chosen] = np.arange(len(chosen))
+    source = np.repeat(np.arange(len(chosen)), np.diff(paths.indptr))
+    target = rank[paths.indices]
+    others = (target >= 0) & (target != source)
+    source, target = source[others], target[others]
     progress("distances", 0.6)
     steps = _steps(xyz, normal, a, b, length_m, rim)
-    walk = _Walk(rows, before, chosen, steps, config.rim_detour_m)
+    walk = _Walk(paths, before, chosen, steps, config.rim_detour_m)
     length, usable = walk.lengths(source, chosen[target])
-    local = np.full(near.shape, np.inf)
+    local = np.full((len(chosen), len(chosen)), np.inf)
     local[source, target] = length
     local = np.fmin(local, local.T)
-    sheet = np.zeros_like(near)
+    sheet = np.zeros(local.shape, dtype=bool)
     sheet[source, target] = usable
     sheet |= sheet.T
     bound = shortest_path(np.where(np.isfinite(local), local, 0.0), method="D", directed=False)
@@ -202,12 +214,19 @@ def pieces(a: Int, b: Int, passable: Bool) -> Int:
 
 def _around(walk: _Walk, count: int) -> tuple[Int, Float, Bool]:
     """Landmarks nearest to each sample, and how far they are."""
-    nearest = np.empty((walk.rows.shape[1], count), dtype=np.int64)
+    by_sample = walk.paths.tocsc()
+    nearest = np.empty((by_sample.shape[1], count), dtype=np.int64)
+    reached = np.empty(nearest.shape, dtype=bool)
     for start in range(0, len(nearest), BLOCK):
-        rows = np.ascontiguousarray(walk.rows[:, start : start + BLOCK].T)
-        nearest[start : start + BLOCK] = np.argpartition(rows, count, axis=1)[:, :count]
+        ends = by_sample.indptr[start : start + BLOCK + 1]
+        known = slice(ends[0], ends[-1])
+        path = np.full((len(ends) - 1, by_sample.shape[0]), np.inf, dtype=np.float32)
+        row = np.repeat(np.arange(len(path)), np.diff(ends))
+        path[row, by_sample.indices[known]] = by_sample.data[known]
+        first = np.argpartition(path, count, axis=1)[:, :count]
+        nearest[start : start + BLOCK] = first
+        reached[start : start + BLOCK] = np.isfinite(np.take_along_axis(path, first, axis=1))
     sample = np.broadcast_to(np.arange(len(nearest))[:, None], nearest.shape)
-    reached = np.isfinite(walk.rows[nearest, sample])
     length = np.full(nearest.shape, np.inf)
     sheet = np.zeros(nearest.shape, dtype=bool)
     length[reached], sheet[reached] = walk.lengths(nearest[reached], sample[reached])
@@ -216,22 +235,27 @@ def _around(walk: _Walk, count: int) -> tuple[Int, Float, Bool]:
 
 def _landmarks(
     graph: csr_matrix, firm: Bool, config: RotationConfig, progress: Progress
-) -> tuple[Int, Float32, NDArray[np.int32]]:
-    """Farthest-point landmarks, their distances to all samples near them, and the paths there."""
+) -> tuple[Int, csr_matrix, NDArray[np.int32]]:
+    """Farthest-point landmarks, their distances to the samples near them, and the paths there."""
     limit = config.local_m
     most = min(config.landmarks, int(firm.sum()))
     nearest = np.where(firm, np.inf, -1.0)
     chosen = np.empty(most, dtype=np.int64)
-    rows = np.empty((most, len(firm)), dtype=np.float32)
-    before = np.empty((most, len(firm)), dtype=np.int32)
+    length: list[Float32] = []
+    before: list[NDArray[np.int32]] = []
+    near: list[NDArray[np.int32]] = []
     for k in range(most):
         if k % GROUP == 0:
             progress("distances", 0.1 + 0.5 * k / most)
         chosen[k] = nearest.argmax()
         row, paths = dijkstra(graph, indices=chosen[k], limit=limit, return_predecessors=True)
-        rows[k], before[k] = row, paths
+        near.append(np.flatnonzero(np.isfinite(row)).astype(np.int32))
+        length.append(row[near[k]].astype(np.float32))
+        before.append(paths[near[k]])
         np.minimum(nearest, row, out=nearest)
-    return chosen, rows, before
+    ends = np.cumsum([0, *map(len, near)])
+    matrix = (np.concatenate(length), np.concatenate(near), ends)
+    return chosen, csr_matrix(matrix, shape=(most, len(firm))), np.concatenate(before)
 
 
 def _steps(xyz: Float, normal: Float, a: Int, b: Int, length_m: Float, rim: Bool) -> _Steps:

@@ -278,7 +278,7 @@ class _Inbox:
                 signal.pthread_kill(_main_thread(), STOP)
             else:
                 views = [self._views[key] for key in rest[0].view_keys]
-                self._put(_JOB, partial(self._do, rest[0], views))
+                self._put(_JOB, partial(self._do, rest[0], views, time.perf_counter()))
 
     def _put(self, priority: int, task: _Task) -> None:
         self._tasks.put((priority, next(self._numbers), task))
@@ -289,10 +289,10 @@ class _Inbox:
             with contextlib.suppress(Exception):  # the job that needs the view will say it
                 work.prepare(view, config)
 
-    def _do(self, job: Job, views: list[View], work: Work) -> None:
+    def _do(self, job: Job, views: list[View], came: float, work: Work) -> None:
         try:
             self.running = job.number
-            outcome = _outcome(work, job, views, _Reporter(self._pipe, job, self))
+            outcome = _outcome(work, job, views, _Reporter(self._pipe, job, self, came))
             self.running = None
         except Cancelled as error:  # just as it ended
             self.running = None
@@ -303,9 +303,10 @@ class _Inbox:
 class _Reporter:
     """The progress callback of a job: reports, times the stages, raises Cancelled."""
 
-    def __init__(self, pipe: Connection, job: Job, inbox: _Inbox) -> None:
+    def __init__(self, pipe: Connection, job: Job, inbox: _Inbox, came: float) -> None:
         self._pipe, self._number, self._inbox = pipe, job.number, inbox
-        self._stage, self._since, self._reported = "", time.perf_counter(), 0.0
+        # a view may have been in preparation when the job came: the job waited for it
+        self._stage, self._since, self._reported = "start", came, 0.0
         self.seconds: dict[str, float] = {}
 
     def __call__(self, stage: str, fraction: float) -> None:
@@ -320,8 +321,7 @@ class _Reporter:
                 self._pipe.send(Step(self._number, stage, fraction))
 
     def close(self, now: float) -> None:
-        if self._stage:
-            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+        self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
         self._since = now
 
 

@@ -44,7 +44,7 @@ class Distances:
 
 
 @dataclass(frozen=True, eq=False)
-class _Steps:
+class Steps:
     """Directed links, sorted, with the step that each makes in its start's tangent plane."""
 
     key: Int  # (2m,) start * n + end
@@ -60,7 +60,7 @@ class _Walk:
     paths: csr_matrix  # (k, n) their lengths, for the samples that are near
     before: NDArray[np.int32]  # sample before each of those on its path, negative at the start
     chosen: Int  # (k,) where the paths start
-    steps: _Steps
+    steps: Steps
     rim_detour_m: float
 
     def lengths(self, landmark: Int, sample: Int) -> tuple[Float, Bool]:
@@ -132,6 +132,7 @@ def surface_distances(
     passable: Bool,
     config: RotationConfig,
     progress: Progress = no_progress,
+    steps: Steps | None = None,
 ) -> Distances:
     """Distances between landmarks of the largest connected piece.
 
@@ -145,6 +146,8 @@ def surface_distances(
         Samples that paths may go through; they may end at any.
     config : RotationConfig
     progress : Progress
+    steps : Steps, optional
+        Result of link_steps for these links, or for more.
 
     Raises
     ------
@@ -179,7 +182,7 @@ def surface_distances(
     others = (target >= 0) & (target != source)
     source, target = source[others], target[others]
     progress("distances", 0.6)
-    steps = _steps(xyz, normal, a, b, length_m, rim)
+    steps = steps or link_steps(xyz, normal, links)
     walk = _Walk(paths, before, chosen, steps, config.rim_detour_m)
     length, usable = walk.lengths(source, chosen[target])
     local = np.full((len(chosen), len(chosen)), np.inf)
@@ -258,8 +261,9 @@ def _landmarks(
     return chosen, csr_matrix(matrix, shape=(most, len(firm))), np.concatenate(before)
 
 
-def _steps(xyz: Float, normal: Float, a: Int, b: Int, length_m: Float, rim: Bool) -> _Steps:
-    start, end = np.r_[a, b], np.r_[b, a]
+def link_steps(xyz: Float, normal: Float, links: Links) -> Steps:
+    """The step that each link makes, either way, in the tangent plane of its start."""
+    start, end = np.r_[links.a, links.b], np.r_[links.b, links.a]
     order = np.argsort(start * len(xyz) + end)
     start, end = start[order], end[order]
     least = np.abs(normal).argmin(1)
@@ -271,9 +275,9 @@ def _steps(xyz: Float, normal: Float, a: Int, b: Int, length_m: Float, rim: Bool
     arriving = (chord * e1[end]).sum(1) + 1j * (chord * e2[end]).sum(1)
     leaving /= np.maximum(np.abs(leaving), 1e-12)
     arriving /= np.maximum(np.abs(arriving), 1e-12)
-    return _Steps(
+    return Steps(
         key=start * len(xyz) + end,
-        step=np.r_[length_m, length_m][order] * leaving,
+        step=np.r_[links.length_m, links.length_m][order] * leaving,
         turn=leaving * arriving.conj(),
-        rim=np.r_[rim, rim][order],
+        rim=np.r_[links.rim, links.rim][order],
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.distances import Distances, surface_distances
+from vflatten_ros.core.distances import Distances, Steps, link_steps, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.fusion import Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
@@ -65,6 +65,7 @@ class Surface:
 
     samples: Samples
     links: Links
+    steps: Steps  # of the links
     edge: Int  # (n,) of sheet_edges
     doubt: Float  # (n,) above 1: may be a ramp between two layers; 0 where nobody looked
     view_id: Int  # (n,) of the measured point nearest to each sample
@@ -105,7 +106,9 @@ def unfold_surface(
     progress("join", 0.0)
     passable, links = _joined(surface, doubt, config, progress)
     samples = surface.samples
-    distances = surface_distances(samples.xyz, samples.normal, links, passable, config, progress)
+    distances = surface_distances(
+        samples.xyz, samples.normal, links, passable, config, progress, surface.steps
+    )
     plane = unfold(distances.bound_m, distances.same_sheet, config, progress)
     progress("outline", 0.0)
     return _unfolded(surface, distances, plane, config)
@@ -151,7 +154,7 @@ def _laid_flat(
     """(n, 2) places of the samples of one piece, roughly; NaN elsewhere."""
     rough = replace(config, landmarks=ROUGH, unfold_rounds=ROUGH_ROUNDS)
     xyz, normal = surface.samples.xyz, surface.samples.normal
-    distances = surface_distances(xyz, normal, links, piece, rough, progress)
+    distances = surface_distances(xyz, normal, links, piece, rough, progress, surface.steps)
     plane = unfold(distances.bound_m, distances.same_sheet, rough, progress)
     uv = place_samples(distances.around, distances.around_m, distances.around_sheet, plane)[0]
     return np.where(distances.inside[:, None], uv, np.nan)
@@ -227,7 +230,8 @@ def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_p
     progress("link", 0.7)
     edge = _edges(samples, links, config)
     doubt = np.zeros(len(samples.xyz))
-    return Surface(samples, links, edge, doubt, fused.view_id, fused.pixel)
+    steps = link_steps(samples.xyz, samples.normal, links)
+    return Surface(samples, links, steps, edge, doubt, fused.view_id, fused.pixel)
 
 
 def doubts(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Float:

@@ -9,6 +9,7 @@ not, and the measured points around them are nearer to a step than to any smooth
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
@@ -23,6 +24,7 @@ STEP_POINTS = 64
 STEP_SOFT = 0.15  # width of the step, in reaches
 DIRECTIONS = 6  # of the step
 NOISE_SIGMAS = 1.0  # of its height that noise alone makes of the best of all directions
+PAIRS = 100_000  # pairs at a time: bounds the memory
 CHUNK = 1024  # samples at a time, so that they stay in the cache
 
 
@@ -66,34 +68,37 @@ def ramps(
 
 def _tilt(xyz: Float, normal: Float) -> Float:
     """Angle of each normal to the mean of those on both sides of it, 0 where a side is missing."""
-    i, j = cKDTree(xyz).query_pairs(RING_M[1], output_type="ndarray").T
-    chord = xyz[j] - xyz[i]
+    pairs = cKDTree(xyz).query_pairs(RING_M[1], output_type="ndarray").astype(np.int32)
+    parts = [_ring(pairs[k : k + PAIRS], xyz, normal) for k in range(0, len(pairs), PAIRS)]
+    i, j = np.concatenate(parts).T if parts else pairs.T
+    chord = xyz[j]
+    chord -= xyz[i]
     length = np.linalg.norm(chord, axis=1)
-    ring = (length > RING_M[0]) & ((normal[i] * normal[j]).sum(1) > 0.3)
-    i, j, chord, length = i[ring], j[ring], chord[ring], length[ring]
-    i, j = np.r_[i, j], np.r_[j, i]
-    toward = np.vstack([chord, -chord])
-    direction = toward / np.r_[length, length][:, None]
-    mean = _unit(_summed(i, normal[j], len(xyz)))
+    count = len(xyz)
+    mean = _unit(_summed(i, normal[j], count) + _summed(j, normal[i], count))
     for _ in range(2):  # the direction of the tilt depends on the mean, and it on the direction
         down = _unit(normal - (normal * mean).sum(1, keepdims=True) * mean)
-        along = (direction * down[i]).sum(1)
-        level = np.abs((toward * mean[i]).sum(1)) < RING_HEIGHT_M
-        ahead, behind = (
-            _side(i[side], normal[j[side]], len(xyz))
-            for side in (level & (along > 0.5), level & (along < -0.5))
-        )
-        both = np.isfinite(ahead).all(1) & np.isfinite(behind).all(1)
+        total, many = np.zeros((2, count, 3)), np.zeros((2, count))
+        for of, to, sign in ((i, j, 1.0), (j, i, -1.0)):
+            along = sign * np.einsum("ni,ni->n", chord, down[of]) / length
+            level = np.abs(np.einsum("ni,ni->n", chord, mean[of])) < RING_HEIGHT_M
+            for k, side in enumerate((level & (along > 0.5), level & (along < -0.5))):
+                total[k] += _summed(of[side], normal[to[side]], count)
+                many[k] += np.bincount(of[side], minlength=count)
+        both = (many > 1).all(0)  # fewer tell nothing
+        ahead, behind = total / np.maximum(many, 1)[..., None]
         mean = np.where(both[:, None], _unit(np.where(both[:, None], ahead + behind, 1.0)), mean)
     cosine = (normal * mean).sum(1).clip(-1.0, 1.0)
     return np.where(both, np.arccos(cosine), 0.0)
 
 
-def _side(of: Int, normal: Float, count: int) -> Float:
-    """Mean normal of those on one side, NaN where there are fewer than two."""
-    many = np.bincount(of, minlength=count)
-    mean = _summed(of, normal, count) / np.maximum(many, 1)[:, None]
-    return np.where((many > 1)[:, None], mean, np.nan)
+def _ring(pairs: NDArray[np.int32], xyz: Float, normal: Float) -> NDArray[np.int32]:
+    """The pairs (p, 2) of samples that are far enough apart and face the same way."""
+    i, j = pairs.T
+    length = np.linalg.norm(xyz[j] - xyz[i], axis=1)
+    alike = np.einsum("ni,ni->n", normal[i], normal[j])
+    kept: NDArray[np.int32] = pairs[(length > RING_M[0]) & (alike > 0.3)]
+    return kept
 
 
 def _summed(of: Int, vectors: Float, count: int) -> Float:

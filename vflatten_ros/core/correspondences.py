@@ -7,13 +7,14 @@ cameras, and how far it is from where the view's surface ends: there another lay
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vflatten_ros.core.config import CorrespondenceConfig, RotationConfig
+from vflatten_ros.core.config import CorrespondenceConfig, IntegrationConfig, RotationConfig
+from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.registration import ViewSurface, register_views
 from vflatten_ros.core.values import Correspondence, Float, Int, Notice, Progress, View, no_progress
@@ -176,11 +177,70 @@ def as_pairs(a: PlacedView, b: PlacedView, matches: Matches) -> tuple[Correspond
     )
 
 
-def rejected(pair: Correspondence, off_m: float) -> Notice:
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Corresponding points that the registered surfaces bear out."""
+
+    used: tuple[Correspondence, ...]
+    points_a: Float  # (k, 3) of the first view of each, common frame
+    points_b: Float
+    normals_a: Float  # (k, 3)
+    normals_b: Float
+    notices: tuple[Notice, ...]  # of the others
+
+
+NONE = np.zeros((0, 3))
+NOTHING_GIVEN = Judged((), NONE, NONE, NONE, NONE, ())
+
+
+def judged(
+    given: Sequence[Correspondence], placed: Mapping[int, PlacedView], config: IntegrationConfig
+) -> Judged:
+    """Check corresponding points against the registration of all views.
+
+    Parameters
+    ----------
+    given : sequence of Correspondence
+        By a person.
+    placed : mapping of int to PlacedView
+        By view_id, the views that are named at least.
+    config : IntegrationConfig
+        reject_m: how far apart the registration may put one point.
+
+    Raises
+    ------
+    NotEnoughViews
+        A view is named that is not there.
+    """
+    used, rows, notices = [], [], []
+    for pair in given:
+        unknown = [i for i in (pair.view_a, pair.view_b) if i not in placed]
+        if unknown:
+            raise NotEnoughViews(f"correspondences name view {unknown[0]}, which is not used")
+        a, b = placed[pair.view_a], placed[pair.view_b]
+        i, j = _at(a, pair.pixel_a), _at(b, pair.pixel_b)
+        off = float(np.linalg.norm(a.points[i] - b.points[j]))
+        if off > config.reject_m:
+            notices.append(rejected(pair, off, "the registration of all views is"))
+            continue
+        used.append(pair)
+        rows.append((a.points[i], b.points[j], a.normals[i], b.normals[j]))
+    if not used:
+        return replace(NOTHING_GIVEN, notices=tuple(notices))
+    at = np.array(rows)  # (k, 4, 3)
+    return Judged(tuple(used), at[:, 0], at[:, 1], at[:, 2], at[:, 3], tuple(notices))
+
+
+def _at(placed: PlacedView, pixel: tuple[int, int]) -> int:
+    """The point of the surface at a pixel, or the nearest one."""
+    away = placed.view.pixel[placed.row] - np.asarray(pixel)
+    return int((away**2).sum(axis=1).argmin())
+
+
+def rejected(pair: Correspondence, off_m: float, judge: str = "the others are") -> Notice:
     """Says that a corresponding point contradicts the others, and by how much."""
     text = (
         f"view {pair.view_a} pixel {pair.pixel_a} and view {pair.view_b} pixel {pair.pixel_b} are "
-        f"{100 * off_m:.1f} cm apart on the item, if the other corresponding points are right; "
-        "left out"
+        f"{100 * off_m:.1f} cm apart on the item, if {judge} right; left out"
     )
     return Notice("correspondence_rejected", text)

@@ -19,6 +19,7 @@ from vflatten_ros.core.parallel import Ahead, Once
 from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, finish, recognise
 from vflatten_ros.core.registration import ViewSurface, view_surface
 from vflatten_ros.core.rotation import (
+    Fused,
     Surface,
     Unfolded,
     doubts,
@@ -79,7 +80,8 @@ def flatten_garment(
         Views of one item that hangs still; config.method says how many are needed.
     correspondences : sequence of Correspondence
         Points of the cloth seen in two views, as a person gives them. 'kita2019' uses the views
-        that they name; without any it chooses two views, and finds points, by itself.
+        that they name; without any it chooses two views, and finds points, by itself. 'rotation'
+        needs none, and joins its surface by those that agree with the registration.
     templates : sequence of Template
         Categories to choose from.
     config : Config
@@ -134,7 +136,10 @@ def _rotation(
     prepared: Mapping[int, ViewSurface],
 ) -> tuple[Flattened, Recognition | None]:
     """The automatic method: all views of a rotation."""
-    unfolded, found = _likeliest(views, prepared, tuple(templates), config, progress)
+    fused = fuse_views(
+        views, config.rotation, progress, prepared, correspondences, config.integration
+    )
+    unfolded, found = _likeliest(fused, tuple(templates), config, progress)
     badness = _badness((unfolded, found))
     for turn in range(TURNS if found.category != UNKNOWN else 0):
         progress("parts", turn / TURNS)
@@ -145,7 +150,7 @@ def _rotation(
         progress("parts", (turn + 0.6) / TURNS)
         found = _refitted(unfolded, found, tuple(templates), config)
     none = np.zeros(0)
-    notices = unfolded.notices
+    notices = fused.given.notices + unfolded.notices
     if badness > DOUBTFUL:
         text = f"no category fits the item well, or it does not lie flat ({badness:.1f})"
         notices = (*notices, Notice("untrusted", text))
@@ -154,15 +159,14 @@ def _rotation(
         start_uv=None,
         lines=GeodesicLines(np.zeros((0, 2, 3)), none.astype(np.int64), none, none, none > 0),
         outline=unfolded.outline,
-        correspondences=(),
+        correspondences=fused.given.used,
         notices=notices,
     )
     return flattened, found
 
 
 def _likeliest(
-    views: Sequence[View],
-    prepared: Mapping[int, ViewSurface],
+    fused: Fused,
     templates: tuple[Template, ...],
     config: Config,
     progress: Progress,
@@ -171,7 +175,6 @@ def _likeliest(
 
     Most items need two tries, so two are made at once, and a result that is not needed is dropped.
     """
-    fused = fuse_views(views, config.rotation, progress, prepared)
     linked = Once(partial(link_surface, fused, config.rotation))
     looked = Once(partial(doubts, fused, config.rotation))
 

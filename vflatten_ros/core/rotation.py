@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.config import IntegrationConfig, RotationConfig
+from vflatten_ros.core.correspondences import NOTHING_GIVEN, Judged, judged, place_view
 from vflatten_ros.core.distances import Distances, Steps, link_steps, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.fusion import Samples, fuse
@@ -26,6 +27,7 @@ from vflatten_ros.core.sheets import Links, link_samples, sheet_edges
 from vflatten_ros.core.unfolding import carry, orientation, overlap, place_samples, settle, unfold
 from vflatten_ros.core.values import (
     Bool,
+    Correspondence,
     FlatPoints,
     Float,
     Int,
@@ -45,6 +47,8 @@ SPUR_REACH = 0.8  # how far a corner goes beyond a disc in it, in radii
 ROUGH, ROUGH_ROUNDS = 120, 4  # landmarks and reweightings where pieces are laid flat by themselves
 MOST_JOINS = 3
 MOST_DOUBTFUL = 0.1  # of the samples, at a doubt of 1
+TOLD_M = 1e-4  # length of a link between samples that are said to be one point of the cloth
+TOLD_AMONG = 8  # samples nearest to such a point, of which the nearest that faces its way is it
 CELL_M = 0.002  # of the image whose contour is the outline
 
 
@@ -57,6 +61,7 @@ class Fused:
     normals: Float  # (m, 3)
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
+    given: Judged = NOTHING_GIVEN  # corresponding points
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +184,8 @@ def fuse_views(
     config: RotationConfig,
     progress: Progress = no_progress,
     prepared: Mapping[int, ViewSurface] | None = None,
+    given: Sequence[Correspondence] = (),
+    limits: IntegrationConfig | None = None,
 ) -> Fused:
     """Register and fuse the views.
 
@@ -190,6 +197,9 @@ def fuse_views(
     progress : Progress
     prepared : mapping of int to ViewSurface, optional
         Results of view_surface by view_id, made as the views arrived.
+    given : sequence of Correspondence
+        By a person. Those that the registration bears out join the surface.
+    limits : IntegrationConfig, optional
 
     Raises
     ------
@@ -206,6 +216,12 @@ def fuse_views(
         surfaces.append(each)
         progress("surface", len(surfaces) / len(views))
     poses = register_views(surfaces, config, progress)
+    named = {i for pair in given for i in (pair.view_a, pair.view_b)}
+    placed = {
+        view.view_id: place_view(view, surface, pose)
+        for view, surface, pose in zip(views, surfaces, poses, strict=True)
+        if view.view_id in named
+    }
     moved = zip(poses, surfaces, strict=True)
     points = np.vstack([transform_points(pose, s.points) for pose, s in moved])
     moved = zip(poses, surfaces, strict=True)
@@ -219,7 +235,8 @@ def fuse_views(
         mine = of_view == k
         pixel[mine] = view.pixel[row[samples.source[mine]]]
     ids = np.array([view.view_id for view in views], dtype=np.int64)
-    return Fused(samples, points, normals, ids[of_view], pixel)
+    checked = judged(given, placed, limits or IntegrationConfig())
+    return Fused(samples, points, normals, ids[of_view], pixel, checked)
 
 
 def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Surface:
@@ -228,10 +245,30 @@ def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_p
     samples = fused.samples
     links = link_samples(samples.xyz, samples.normal, config)
     progress("link", 0.7)
+    links = links.with_links(*_told(fused, config), TOLD_M)
     edge = _edges(samples, links, config)
     doubt = np.zeros(len(samples.xyz))
     steps = link_steps(samples.xyz, samples.normal, links)
     return Surface(samples, links, steps, edge, doubt, fused.view_id, fused.pixel)
+
+
+def _told(fused: Fused, config: RotationConfig) -> tuple[Int, Int]:
+    """Samples that are one point of the cloth by the corresponding points given."""
+    samples, given = fused.samples, fused.given
+    if not given.used:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    tree = cKDTree(samples.xyz)
+    ends = []
+    for points, normals in ((given.points_a, given.normals_a), (given.points_b, given.normals_b)):
+        away, near = tree.query(points, k=TOLD_AMONG, distance_upper_bound=config.link_m)
+        alike = np.einsum("kni,ki->kn", samples.normal[near % len(samples.xyz)], normals) > 0.5
+        away = np.where(alike, away, np.inf)
+        best = away.argmin(axis=1)
+        rows = np.arange(len(points))
+        ends.append(np.where(np.isfinite(away[rows, best]), near[rows, best], -1))
+    one, other = ends
+    apart = (one >= 0) & (other >= 0) & (one != other)
+    return one[apart], other[apart]
 
 
 def doubts(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Float:

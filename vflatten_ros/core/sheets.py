@@ -36,6 +36,24 @@ class Links:
             self.a[keep], self.b[keep], self.length_m[keep], self.rim[keep], self.doubt[keep]
         )
 
+    def with_links(self, a: Int, b: Int, length_m: float) -> Links:
+        """With links on one sheet between some pairs of samples, in place of what was there."""
+        if not len(a):
+            return self
+        pairs = np.unique(np.sort(np.column_stack([a, b]), axis=1), axis=0)
+        told = set(map(tuple, pairs.tolist()))
+        rest = self.part(
+            np.array([p not in told for p in zip(self.a.tolist(), self.b.tolist(), strict=True)])
+        )
+        count = len(pairs)
+        return Links(
+            np.r_[rest.a, pairs[:, 0]],
+            np.r_[rest.b, pairs[:, 1]],
+            np.r_[rest.length_m, np.full(count, length_m)],
+            np.r_[rest.rim, np.zeros(count, dtype=bool)],
+            np.r_[rest.doubt, np.zeros(count)],
+        )
+
 
 def link_samples(xyz: Float, normal: Float, config: RotationConfig) -> Links:
     """Links of every sample to those around it on its own sheet and round its edge.

@@ -13,6 +13,7 @@ import garments
 
 from vflatten_ros.worker import STOP
 
+ENOUGH = 10  # views
 GOOD, SLOW, STUBBORN, CRASH, WRONG, MISTAKE, SILENT = 30, 31, 32, 33, 34, 35, 36
 
 

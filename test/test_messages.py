@@ -15,6 +15,7 @@ from vflatten_ros import displays, messages
 from vflatten_ros.core.buffer import BufferState, Stage
 from vflatten_ros.core.errors import InvalidCorrespondence
 from vflatten_ros.core.geometry import transform_points
+from vflatten_ros.core.values import Unseen, ViewShare
 
 VIEWS = example_views()
 GARMENT = example_garment(VIEWS)
@@ -68,6 +69,23 @@ def test_buffer_state_counts_and_sorts():
     assert fields["drop_counts"].tolist() == [2, 4]
     assert fields["state"] == 1
     assert messages.stamp_ns(fields["header"]["stamp"]) == VIEWS[1].stamp_ns
+
+
+def test_what_views_add_and_where_to_turn():
+    shares = tuple(ViewShare(i, 0.5 + i / 100, 0.125, 0.25) for i in (2, 5))
+    garment = replace(GARMENT, shares=shares, unseen=Unseen(1.5), enough=True)
+    fields = messages.flattened_view_fields(garment, VIEWS)
+    assert fields["view_shows"].tolist() == pytest.approx([0.52, 0.55])
+    assert fields["view_only"].tolist() == [0.125, 0.125]
+    assert fields["view_first"].tolist() == [0.25, 0.25]
+    estimate = messages.garment_estimate_fields(garment, VIEWS)
+    assert (estimate["enough"], estimate["unseen"], estimate["turn_to"]) == (True, 1, 1.5)
+    regrasp = replace(garment, unseen=Unseen(None))
+    estimate = messages.garment_estimate_fields(regrasp, VIEWS)
+    assert estimate["unseen"] == 2 and np.isnan(estimate["turn_to"])
+    plain = messages.garment_estimate_fields(GARMENT, VIEWS)
+    assert (plain["enough"], plain["unseen"]) == (False, 0) and np.isnan(plain["turn_to"])
+    assert not len(messages.flattened_view_fields(GARMENT, VIEWS)["view_shows"])
 
 
 def test_flattened_view_holds_the_garment_in_float32():

@@ -1,5 +1,6 @@
 """The JSON object: keys, frames, and identity with the messages."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -8,6 +9,7 @@ from garments import CALIBRATION, example_garment, example_views
 
 from vflatten_ros import messages, results
 from vflatten_ros.core.geometry import rotation_about
+from vflatten_ros.core.values import Unseen, ViewShare
 
 VIEWS = example_views()
 GARMENT = example_garment(VIEWS)
@@ -22,6 +24,19 @@ def test_sizes_category_and_notices():
     assert RESULT["notices"][0]["code"] == "length_unseen"
     assert RESULT["warnings"] == ["the lower left corner is in no view"]
     assert [view["id"] for view in RESULT["views"]] == [2, 5]
+
+
+def test_what_views_add_and_where_to_turn():
+    assert RESULT["unseen"] is None and RESULT["enough"] is False
+    assert RESULT["views"][0]["only"] is None
+    shares = tuple(ViewShare(i, 0.5, 0.125, 0.25) for i in (2, 5))
+    garment = dataclasses.replace(GARMENT, shares=shares, unseen=Unseen(1.5), enough=True)
+    result = results.garment_result(garment, VIEWS)
+    assert result["unseen"] == {"turn_to_rad": 1.5} and result["enough"] is True
+    view = {key: result["views"][1][key] for key in ("id", "shows", "only", "first")}
+    assert view == {"id": 5, "shows": 0.5, "only": 0.125, "first": 0.25}
+    regrasp = dataclasses.replace(garment, unseen=Unseen(None))
+    assert results.garment_result(regrasp, VIEWS)["unseen"] == {"turn_to_rad": None}
 
 
 def test_every_point_is_a_pixel_of_its_view():

@@ -59,6 +59,20 @@ def test_category_sizes_and_places_come_out_right(name):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "counts", "enough"), [("SK2_1", (8, 12), True), ("LS1_1", (12, 22), True)]
+)
+def test_views_in_order_are_enough_once_the_answer_is_right_and_not_before(name, counts, enough):
+    category = None
+    for count in counts:
+        garment = replay_recording(BAGS / name, ALL_VIEWS, view_ids=range(count)).garment
+        category, wrong = errors(garment, BAGS / name) if garment.measurements else ("", [1.0, 1.0])
+        assert garment.enough == (garment.category == category and max(wrong) < 0.07)
+        assert garment.enough or garment.unseen.turn_to_rad is not None
+    assert garment.enough == enough
+
+
+@pytest.mark.slow
 def test_layers_that_lie_flush_spoil_the_skirt_unless_they_are_looked_for(monkeypatch):
     monkeypatch.setattr(pipeline, "DOUBTS", (np.inf,))
     monkeypatch.setattr(pipeline, "ENOUGH", ())

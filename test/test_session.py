@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import garments
 import numpy as np
 import pytest
@@ -81,6 +83,38 @@ def test_a_new_item_has_no_pairs_and_no_selection(held):
     assert any(isinstance(event, ItemStarted) for event in events)
     assert not held.pairs
     assert held.selected() == ()
+
+
+def turned(count, step_deg=15.0):
+    """A session whose views cover a part of the turn."""
+    item = Session(garments.CALIBRATION, Config())
+    plain = garments.example_view(0, 0.0)
+    for k in range(count):
+        angle = np.radians(k * step_deg)
+        item.buffer._views[k] = dataclasses.replace(plain, view_id=k, angle_rad=angle)
+        item.buffer._rates[k] = 0.0
+    return item
+
+
+def test_early_looks_come_every_so_many_degrees_until_the_views_are_enough():
+    item = turned(6)
+    assert not item.due(0.0)  # not asked for
+    assert item.due(45.0)
+    item.looked()
+    assert not item.due(45.0)
+    for k, due in ((6, False), (7, False), (8, True)):
+        item.buffer._views[k] = dataclasses.replace(
+            item.buffer._views[0], view_id=k, angle_rad=np.radians(15.0 * k)
+        )
+        assert item.due(45.0) == due
+    item.enough = True
+    assert not item.due(45.0)
+    item.new_item("requested")
+    assert not item.enough and not item.due(45.0)
+
+
+def test_too_few_views_are_not_looked_at():
+    assert not turned(5, 40.0).due(45.0)
 
 
 def test_a_task_holds_the_views_in_the_order_asked_for_and_their_pairs(held):

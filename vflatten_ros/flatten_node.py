@@ -25,6 +25,7 @@ from vflatten_ros.core.events import (
     Event,
     ItemStarted,
     RotationComplete,
+    ViewAdded,
 )
 from vflatten_ros.core.values import Calibration, FlatGarment
 from vflatten_ros.files import load_calibration
@@ -226,6 +227,8 @@ class FlattenNode(AnsweringLifecycleNode):
             self.buffer_changed()
         if any(isinstance(event, RotationComplete) for event in events):
             self._flatten_by_itself()
+        elif any(isinstance(event, ViewAdded) for event in events):
+            self._look_early()
 
     def _note(self, event: Event) -> None:
         if isinstance(event, ItemStarted):
@@ -268,13 +271,26 @@ class FlattenNode(AnsweringLifecycleNode):
         return self.goals.progress if self.goals is not None else 0.0
 
     def _flatten_by_itself(self) -> None:
-        if not self.settings.node.node.auto_flatten or self.goals is None:
+        if self.settings.node.node.auto_flatten:
+            self._submit_own()
+
+    def _submit_own(self) -> None:
+        if self.goals is None:
             return
         try:
             task = self.active_session().task(self.settings.core)
         except Refused:
             return
         self.goals.submit(task, Listener(lambda stage, fraction: None, self._log_failure))
+
+    def _look_early(self) -> None:
+        """Flatten what there is so far, if nothing else is being flattened."""
+        idle = self.goals is not None and self.goals.ready and not self.goals.busy
+        if self.session is None or not idle or self.settings.core.method != "rotation":
+            return
+        if self.session.due(self.settings.node.node.look_early_deg):
+            self.session.looked()
+            self._submit_own()
 
     def _log_failure(self, outcome: Outcome) -> None:
         if outcome.garment is None and not outcome.cancelled:
@@ -299,6 +315,11 @@ class FlattenNode(AnsweringLifecycleNode):
         self._last = summary(outcome.garment)
         if self.session is not None and task.item == self.session.buffer.state().item:
             self.last_garment = outcome.garment
+            if outcome.garment.enough and not self.session.enough:
+                self.session.enough = True
+                count = len(outcome.garment.view_ids)
+                self.log.info(f"item {task.item}: {count} views are enough")
+                self.buffer_changed()
         self._results.publish_result(outcome.messages, self.settings.node.outputs)
         total = sum(outcome.seconds.values())
         self.log.info(f"item {task.item} flattened in {total:.2f} s: {self._last}")

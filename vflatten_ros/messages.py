@@ -34,6 +34,8 @@ R_SCORE, PROBABILITY = 0, 1  # GarmentEstimate.score_kind
 MANUAL, AUTOMATIC = 0, 1  # Correspondence.origin
 PIXEL, POINT = 0, 1  # Correspondence.given_a, given_b
 
+UNSEEN_NOTHING, UNSEEN_TURN, UNSEEN_REGRASP = 0, 1, 2  # GarmentEstimate.unseen
+
 PIXEL_REACH = 3.0  # pixels; a pixel given by hand may miss the item's edge by this much
 POINT_REACH_M = 0.02  # a point given by hand may miss the surface by this much
 
@@ -83,6 +85,7 @@ def flattened_view_fields(garment: FlatGarment, views: Sequence[View]) -> Fields
         "method": garment.method,
         "view_ids": np.array(garment.view_ids, dtype=np.uint32),
         "view_angles": angles_of(garment, views),
+        **_share_fields(garment),
         "contour_u": outline.uv[:, 0].astype(np.float32),
         "contour_v": outline.uv[:, 1].astype(np.float32),
         "contour_sigma": outline.sigma_m.astype(np.float32),
@@ -119,9 +122,32 @@ def garment_estimate_fields(garment: FlatGarment, views: Sequence[View]) -> Fiel
         "landmarks": [landmark_fields(mark) for mark in garment.landmarks],
         "coverage": f32(garment.coverage),
         "quality": f32(garment.quality),
+        "enough": bool(garment.enough),
+        "unseen": _unseen_kind(garment),
+        "turn_to": _turn_to(garment),
         "trusted": all(notice.code != "untrusted" for notice in garment.notices),
         **_notice_fields(garment),
     }
+
+
+def _share_fields(garment: FlatGarment) -> Fields:
+    known = {share.view_id: share for share in garment.shares}
+    shares = [known[i] for i in garment.view_ids if i in known]
+    return {
+        f"view_{name}": np.array([getattr(share, name) for share in shares], dtype=np.float32)
+        for name in ("shows", "only", "first")
+    }
+
+
+def _unseen_kind(garment: FlatGarment) -> int:
+    if garment.unseen is None:
+        return UNSEEN_NOTHING
+    return UNSEEN_REGRASP if garment.unseen.turn_to_rad is None else UNSEEN_TURN
+
+
+def _turn_to(garment: FlatGarment) -> float:
+    angle = garment.unseen.turn_to_rad if garment.unseen is not None else None
+    return float("nan") if angle is None else float(angle)
 
 
 def measurement_fields(measurement: Measurement) -> Fields:
@@ -170,6 +196,7 @@ def view_buffer_state_fields(
     *,
     selected: Iterable[int],
     correspondences: int,
+    enough: bool = False,
 ) -> Fields:
     """vflatten_ros/ViewBufferState; `selected` are ids, `correspondences` the pairs stored."""
     chosen = set(selected)
@@ -180,6 +207,7 @@ def view_buffer_state_fields(
         "state": int(state.stage.value),
         "item": int(state.item),
         "views": [view_info_fields(view, view.view_id in chosen) for view in by_id],
+        "enough": bool(enough),
         "angle_covered": float(state.angle_covered_rad),
         "bytes": int(state.nbytes),
         "correspondences": int(correspondences),

@@ -78,6 +78,7 @@ def buffer_message(session: Session | None) -> ViewBufferState:
         session.calibration.frame,
         selected=session.selected(),
         correspondences=len(session.pairs),
+        enough=session.enough,
     )
     return messages.fill(ViewBufferState(), fields)
 

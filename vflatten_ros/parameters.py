@@ -32,6 +32,13 @@ class NodeOptions(Checked):
         True, "Configure and activate at start, without a lifecycle manager.", read_only=True
     )
     auto_flatten: bool = option(True, "Flatten by itself when a rotation is complete.")
+    look_early_deg: float = option(
+        0.0,
+        "Flatten every so many degrees before the rotation is complete, to say when the views are "
+        "enough, deg; 0: not. Each look is a flattening; with method rotation only.",
+        low=0.0,
+        high=360.0,
+    )
     categories: str = option(
         "", "Folder of the category files; empty: those that come with the package.", read_only=True
     )

@@ -19,6 +19,8 @@ from vflatten_ros.core.values import Calibration, FlatGarment, Float, View
 from vflatten_ros.messages import (
     INFERRED,
     PROBABILITY,
+    UNSEEN_NOTHING,
+    UNSEEN_TURN,
     flattened_view_fields,
     garment_estimate_fields,
     stamp_ns,
@@ -66,15 +68,14 @@ def result_from_fields(
         "length_sigma_m": _size(sizes.get("length"), "sigma"),
         "measurements": [_measurement(m) for m in estimate["measurements"]],
         "trusted": bool(estimate["trusted"]),
+        "enough": bool(estimate["enough"]),
+        "unseen": _unseen(estimate),
         "quality": float(estimate["quality"]),
         "coverage": float(estimate["coverage"]),
         "method": flattened["method"],
         "stamp_ns": stamp_ns(flattened["header"]["stamp"]),
         "frame": flattened["header"]["frame_id"],
-        "views": [
-            {"id": int(i), "angle_rad": float(angle)}
-            for i, angle in zip(flattened["view_ids"], flattened["view_angles"], strict=True)
-        ],
+        "views": _views(flattened),
         "warnings": list(estimate["notice_texts"]),
         "notices": [
             {"code": code, "text": text}
@@ -87,6 +88,29 @@ def result_from_fields(
         "stress_rms_m": float(flattened["stress_rms"]),
         "points": _points(flattened),
     }
+
+
+def _views(flattened: Mapping[str, Any]) -> list[Result]:
+    """Views used; their shares of what was seen are null where they are not known."""
+    known = len(flattened["view_shows"]) == len(flattened["view_ids"])
+    return [
+        {
+            "id": int(i),
+            "angle_rad": float(flattened["view_angles"][k]),
+            **{
+                name: float(flattened[f"view_{name}"][k]) if known else None
+                for name in ("shows", "only", "first")
+            },
+        }
+        for k, i in enumerate(flattened["view_ids"])
+    ]
+
+
+def _unseen(estimate: Mapping[str, Any]) -> Result | None:
+    kind = int(estimate["unseen"])
+    if kind == UNSEEN_NOTHING:
+        return None
+    return {"turn_to_rad": float(estimate["turn_to"]) if kind == UNSEEN_TURN else None}
 
 
 def _size(measurement: Mapping[str, Any] | None, key: str) -> float | None:

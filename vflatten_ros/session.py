@@ -11,7 +11,7 @@ from vflatten_ros import messages
 from vflatten_ros.core.buffer import ViewBuffer
 from vflatten_ros.core.config import METHODS, Config
 from vflatten_ros.core.errors import InvalidCorrespondence, VFlattenError
-from vflatten_ros.core.events import CloudDropped, Event, ItemStarted
+from vflatten_ros.core.events import CloudDropped, Event, ItemStarted, Stage
 from vflatten_ros.core.joints import MAX_POSITION_RAD
 from vflatten_ros.core.values import Calibration, Cloud, Correspondence, View
 from vflatten_ros.goals import Task
@@ -39,6 +39,8 @@ class Session:
         self.buffer = ViewBuffer(calibration, config)
         self.pairs: dict[int, Correspondence] = {}
         self.wrist_rad: float | None = None  # newest joint position
+        self.enough = False  # a result so far says that further views would hardly change it
+        self._looked_rad = 0.0  # angle covered when the last early look began
         self._selection: tuple[int, ...] | None = None
         self._next_pair = 1
 
@@ -77,6 +79,7 @@ class Session:
         if any(isinstance(event, ItemStarted) for event in events):
             self.pairs.clear()
             self._selection = None
+            self.enough, self._looked_rad = False, 0.0
         elif any(isinstance(event, CloudDropped) for event in events):
             self._forget_missing()
         return events
@@ -88,6 +91,27 @@ class Session:
             del self.pairs[number]
         if self._selection is not None:
             self._selection = tuple(i for i in self._selection if i in held) or None
+
+    def due(self, every_deg: float) -> bool:
+        """Whether the rotation, not complete, has come far enough for an early look.
+
+        Parameters
+        ----------
+        every_deg : float
+            Angle between two looks, deg; 0: none.
+        """
+        state = self.buffer.state()
+        return (
+            every_deg > 0.0
+            and not self.enough
+            and state.stage is Stage.GATHERING
+            and len(state.view_ids) >= self.buffer.min_views
+            and state.angle_covered_rad - self._looked_rad >= math.radians(every_deg) - 1e-6
+        )
+
+    def looked(self) -> None:
+        """An early look begins."""
+        self._looked_rad = self.buffer.state().angle_covered_rad
 
     # ---- views
 

@@ -20,6 +20,7 @@ class QuickWork(slow_work.SlowWork):
             view_ids=tuple(view.view_id for view in views),
             stamp_ns=max(view.stamp_ns for view in views),
             correspondences=task.correspondences,
+            enough=len(views) >= slow_work.ENOUGH,
         )
         return towel, job.serialized(towel, views)
 

@@ -34,6 +34,24 @@ def test_all_clouds_at_four_times_the_rate_are_buffered_and_flattened_without_as
     assert int(after["lost in transport"]) == int(before["lost in transport"])
 
 
+def test_on_the_way_the_node_says_when_the_views_are_enough(rig):
+    rig.set_parameter("look_early_deg", 45.0)
+    before = len(rig.node.log())
+    try:
+        rig.play("--rate", 4, "--best-effort")
+        rig.until(lambda: rig.buffer().enough, "enough views")
+        line = next(
+            line for line in rig.node.log()[before:].splitlines() if "views are enough" in line
+        )
+        count = int(line.split(" views are enough")[0].split()[-1])
+        assert slow_work.ENOUGH <= count < 24
+        rig.until(rig.complete, "the rotation")
+    finally:
+        rig.set_parameter("look_early_deg", 0.0)
+    assert rig.ask("new_item").success
+    assert not rig.buffer().enough
+
+
 def test_a_late_planner_gets_every_output(rig):
     rig.serves_a_good_rotation()
     late = rclpy.create_node("late", namespace=rig.namespace)

@@ -388,6 +388,11 @@ class ViewBuffer:
     # ---- the rotation
 
     @property
+    def min_views(self) -> int:
+        """Fewest views of a complete rotation."""
+        return self._config.buffer.min_views
+
+    @property
     def _max_gap_rad(self) -> float:
         return float(np.radians(self._config.buffer.max_gap_deg))
 

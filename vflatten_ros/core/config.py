@@ -315,6 +315,13 @@ class ViewsConfig(Checked):
     pairs: int = option(
         6, "Most pairs of views that the two-view method tries by itself.", low=1, high=1000
     )
+    enough_probability: float = option(
+        0.9, "Least probability of the category for the views to be enough.", low=0.0, high=1.0
+    )
+    enough_sigma: float = option(
+        0.06, "Most deviation, one sigma, of width and length for that, as a share of each.",
+        low=0.0, high=1.0,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from vflatten_ros.core.rotation import (
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.two_views import flatten_two_views, named_views
+from vflatten_ros.core.unseen import advice, coverage, enough, notice_of
 from vflatten_ros.core.values import (
     Correspondence,
     FlatGarment,
@@ -161,6 +162,7 @@ def _rotation(
         outline=unfolded.outline,
         correspondences=fused.given.used,
         notices=notices,
+        seen=coverage(unfolded.surface, views),
     )
     return flattened, found
 
@@ -252,7 +254,7 @@ def _described(
         replace(m, sigma_m=float(np.hypot(m.sigma_m, shared))) for m in measured.measurements
     )
     told = {notice.code for notice in flattened.notices}
-    return FlatGarment(
+    garment = FlatGarment(
         method=config.method,
         view_ids=tuple(used),
         stamp_ns=max(v.stamp_ns for v in views if v.view_id in used),
@@ -271,6 +273,17 @@ def _described(
         quality=measured.quality,
         notices=flattened.notices + tuple(n for n in measured.notices if n.code not in told),
     )
+    if flattened.seen is None:
+        return garment
+    unseen = advice(garment, flattened.seen, config.measurement.low_coverage)
+    more = () if unseen is None else (notice_of(unseen),)
+    garment = replace(
+        garment,
+        notices=garment.notices + more,
+        shares=flattened.seen.shares,
+        unseen=unseen,
+    )
+    return replace(garment, enough=enough(garment, config.views))
 
 
 def _refitted(

@@ -191,6 +191,33 @@ class FlatPiece:
     surface: FlatSurface
 
 
+@dataclass(frozen=True)
+class ViewShare:
+    """What one view shows of all cloth that any view shows, as shares of it."""
+
+    view_id: int
+    shows: float
+    only: float  # that no other view shows
+    first: float  # that no view of a smaller id shows
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What the views show of the item, and from where more would be seen."""
+
+    shares: tuple[ViewShare, ...]  # by view_id
+    unseen_share: float  # of the ends of what was seen, beyond which cloth goes on
+    open_share: float  # the same, where no view was taken from where that would be seen
+    turn_to_rad: float | None  # item angle, 0 to 2 pi, that promises most; None: all were tried
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Cloth that matters is in no view."""
+
+    turn_to_rad: float | None  # item angle, 0 to 2 pi, that shows it best; None: turning cannot
+
+
 @dataclass(frozen=True, eq=False)
 class Flattened:
     """What a method makes of the views, before the category is known."""
@@ -204,6 +231,7 @@ class Flattened:
     pieces: tuple[FlatPiece, ...] = field(
         default=()
     )  # the largest is the outline's; others are loose
+    seen: Coverage | None = None  # None: not known
 
 
 @dataclass(frozen=True)
@@ -250,6 +278,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "correspondence_rejected": "a corresponding point contradicts the others",
     "views_chosen": "which views the two-view method chose by itself",
     "high_stress": "the distances contradict each other more than noise explains",
+    "unseen": "no view shows some cloth that matters: turn, or grasp elsewhere",
     "truncated": "the item reaches the border of the image",
     "untrusted": "the result should not be used for sizes",
 }
@@ -278,6 +307,9 @@ class FlatGarment:
     coverage: float  # 0-1, share of the template's area that was seen
     quality: float  # 0-1, higher is better
     notices: tuple[Notice, ...] = field(default=())
+    shares: tuple[ViewShare, ...] = ()  # by view_id; empty: not known
+    unseen: Unseen | None = None  # None: nothing that matters
+    enough: bool = False  # further views would hardly change the answer
 
     def measurement(self, name: str) -> Measurement | None:
         """The measurement of that name, None if it was not made."""

@@ -299,6 +299,16 @@ class CorrespondenceConfig(Checked):
     feature_most: float = option(
         300.0, "Most that features of the same place differ in their descriptor.", low=1.0, high=1e4
     )
+    check_pairs: int = option(
+        4,
+        "Pairs of neighbouring views whose features check the registration of all views; 0: none.",
+        low=0,
+        high=1000,
+    )
+    slide_m: float = option(
+        0.003, "Features this far from where the registration puts them are told, m.",
+        low=1e-4, high=0.1,
+    )  # fmt: skip
     feature_agree_m: float = option(
         0.004, "Features agree that one motion brings this near, m.", low=0.001, high=0.05
     )

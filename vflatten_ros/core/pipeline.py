@@ -138,7 +138,13 @@ def _rotation(
 ) -> tuple[Flattened, Recognition | None]:
     """The automatic method: all views of a rotation."""
     fused = fuse_views(
-        views, config.rotation, progress, prepared, correspondences, config.integration
+        views,
+        config.rotation,
+        progress,
+        prepared,
+        correspondences,
+        config.integration,
+        config.correspondences,
     )
     unfolded, found = _likeliest(fused, tuple(templates), config, progress)
     badness = _badness((unfolded, found))
@@ -151,7 +157,7 @@ def _rotation(
         progress("parts", (turn + 0.6) / TURNS)
         found = _refitted(unfolded, found, tuple(templates), config)
     none = np.zeros(0)
-    notices = fused.given.notices + unfolded.notices
+    notices = fused.notices + fused.given.notices + unfolded.notices
     if badness > DOUBTFUL:
         text = f"no category fits the item well, or it does not lie flat ({badness:.1f})"
         notices = (*notices, Notice("untrusted", text))

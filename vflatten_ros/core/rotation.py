@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vflatten_ros.core.config import IntegrationConfig, RotationConfig
+from vflatten_ros.core.config import CorrespondenceConfig, IntegrationConfig, RotationConfig
 from vflatten_ros.core.correspondences import NOTHING_GIVEN, Judged, judged, place_view
 from vflatten_ros.core.distances import Distances, Steps, link_steps, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
@@ -24,6 +24,8 @@ from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.ramps import ramps
 from vflatten_ros.core.registration import ViewSurface, register_views, view_surface
 from vflatten_ros.core.sheets import Links, link_samples, sheet_edges
+from vflatten_ros.core.slide import neighbours, slide_m
+from vflatten_ros.core.slide import notice_of as slide_notice
 from vflatten_ros.core.unfolding import carry, orientation, overlap, place_samples, settle, unfold
 from vflatten_ros.core.values import (
     Bool,
@@ -62,6 +64,7 @@ class Fused:
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
     given: Judged = NOTHING_GIVEN  # corresponding points
+    notices: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +189,7 @@ def fuse_views(
     prepared: Mapping[int, ViewSurface] | None = None,
     given: Sequence[Correspondence] = (),
     limits: IntegrationConfig | None = None,
+    prints: CorrespondenceConfig | None = None,
 ) -> Fused:
     """Register and fuse the views.
 
@@ -200,6 +204,8 @@ def fuse_views(
     given : sequence of Correspondence
         By a person. Those that the registration bears out join the surface.
     limits : IntegrationConfig, optional
+    prints : CorrespondenceConfig, optional
+        With it, features of some neighbouring views check the registration.
 
     Raises
     ------
@@ -216,7 +222,11 @@ def fuse_views(
         surfaces.append(each)
         progress("surface", len(surfaces) / len(views))
     poses = register_views(surfaces, config, progress)
+    looked = []
+    if prints is not None and prints.features:
+        looked = neighbours({view.view_id: view.angle_rad for view in views}, prints.check_pairs)
     named = {i for pair in given for i in (pair.view_a, pair.view_b)}
+    named |= {i for pair in looked for i in pair}
     placed = {
         view.view_id: place_view(view, surface, pose)
         for view, surface, pose in zip(views, surfaces, poses, strict=True)
@@ -235,8 +245,14 @@ def fuse_views(
         mine = of_view == k
         pixel[mine] = view.pixel[row[samples.source[mine]]]
     ids = np.array([view.view_id for view in views], dtype=np.int64)
+    slid = None
+    if prints is not None and looked:
+        progress("fuse", 0.9)
+        slid = slide_m([(placed[i], placed[j]) for i, j in looked], prints)
+    doubted = prints is not None and slid is not None and slid > prints.slide_m
+    notices = (slide_notice(slid),) if slid is not None and doubted else ()
     checked = judged(given, placed, limits or IntegrationConfig())
-    return Fused(samples, points, normals, ids[of_view], pixel, checked)
+    return Fused(samples, points, normals, ids[of_view], pixel, checked, notices)
 
 
 def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Surface:

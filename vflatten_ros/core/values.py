@@ -276,6 +276,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "category_uncertain": "two categories fit nearly as well",
     "solution_uncertain": "the item may lie otherwise, with another width or length",
     "correspondence_rejected": "a corresponding point contradicts the others",
+    "views_misplaced": "a print on the cloth contradicts the registration of the views",
     "views_chosen": "which views the two-view method chose by itself",
     "high_stress": "the distances contradict each other more than noise explains",
     "unseen": "no view shows some cloth that matters: turn, or grasp elsewhere",

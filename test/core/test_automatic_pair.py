@@ -13,7 +13,7 @@ from vflatten_ros.categories import load_templates
 from vflatten_ros.core.automatic_pair import corresponding, fill_up, placed_views
 from vflatten_ros.core.config import Config, CorrespondenceConfig
 from vflatten_ros.core.errors import DisconnectedSurface, InvalidCorrespondence, NotEnoughViews
-from vflatten_ros.core.pipeline import flatten_garment
+from vflatten_ros.core.pipeline import flatten_garment, prepare_view
 from vflatten_ros.core.values import no_progress
 from vflatten_ros.core.view_choice import pair_values
 
@@ -64,8 +64,9 @@ def test_the_points_are_found_and_say_so(chosen):
         assert np.linalg.norm(places[0] - places[1]) < 0.006
 
 
-def test_neither_the_order_nor_preparation_changes_anything(chosen):
-    other = flatten_garment(VIEWS, (), TEMPLATES, CONFIG)
+def test_views_prepared_before_give_the_same(chosen):
+    prepared = {view.view_id: prepare_view(view, CONFIG) for view in VIEWS}
+    other = flatten_garment(VIEWS, (), TEMPLATES, CONFIG, prepared=prepared)
     np.testing.assert_array_equal(other.outline.uv, chosen.outline.uv)
     assert other.correspondences == chosen.correspondences
 

@@ -76,6 +76,7 @@ def test_a_link_takes_the_place_of_the_one_that_was_there():
         np.array([0.0, 2.0, 0.0]),
     )
     found = links.with_links(np.array([2, 3]), np.array([0, 1]), TOLD_M)
+    assert len(found.a) == 4
     table = {
         (a, b): (length, rim, doubt)
         for a, b, length, rim, doubt in zip(*dataclasses.astuple(found), strict=True)

@@ -82,9 +82,9 @@ def test_what_views_add_and_where_to_turn():
     assert (estimate["enough"], estimate["unseen"], estimate["turn_to"]) == (True, 1, 1.5)
     regrasp = replace(garment, unseen=Unseen(None))
     estimate = messages.garment_estimate_fields(regrasp, VIEWS)
-    assert estimate["unseen"] == 2 and np.isnan(estimate["turn_to"])
+    assert (estimate["unseen"], estimate["turn_to"]) == (2, 0.0)
     plain = messages.garment_estimate_fields(GARMENT, VIEWS)
-    assert (plain["enough"], plain["unseen"]) == (False, 0) and np.isnan(plain["turn_to"])
+    assert (plain["enough"], plain["unseen"], plain["turn_to"]) == (False, 0, 0.0)
     assert not len(messages.flattened_view_fields(GARMENT, VIEWS)["view_shows"])
 
 

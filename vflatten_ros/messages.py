@@ -147,7 +147,7 @@ def _unseen_kind(garment: FlatGarment) -> int:
 
 def _turn_to(garment: FlatGarment) -> float:
     angle = garment.unseen.turn_to_rad if garment.unseen is not None else None
-    return float("nan") if angle is None else float(angle)
+    return 0.0 if angle is None else float(angle)
 
 
 def measurement_fields(measurement: Measurement) -> Fields:

@@ -9,6 +9,7 @@ import pytest
 from garments import CALIBRATION, example_garment
 
 from vflatten_ros.core.config import RotationConfig, ViewsConfig
+from vflatten_ros.core.distances import link_steps
 from vflatten_ros.core.fusion import Samples
 from vflatten_ros.core.geometry import inverse
 from vflatten_ros.core.rotation import Surface
@@ -41,7 +42,8 @@ def surface_of(xyz, normal, seen):
     n = len(xyz)
     samples = Samples(xyz, normal, np.full(n, 3e-4), np.arange(n), seen)
     none = np.zeros(n, dtype=np.int64)
-    return Surface(samples, links, edge, np.zeros(n), none, np.column_stack([none, none]))
+    steps = link_steps(xyz, normal, links)
+    return Surface(samples, links, steps, edge, np.zeros(n), none, np.column_stack([none, none]))
 
 
 def tube(angles_deg):

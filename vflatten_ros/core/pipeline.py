@@ -146,7 +146,9 @@ def _rotation(
         config.integration,
         config.correspondences,
     )
+    given, told = fused.given, fused.notices + fused.given.notices
     unfolded, found = _likeliest(fused, tuple(templates), config, progress)
+    del fused  # its points are many
     badness = _badness((unfolded, found))
     for turn in range(TURNS if found.category != UNKNOWN else 0):
         progress("parts", turn / TURNS)
@@ -157,7 +159,7 @@ def _rotation(
         progress("parts", (turn + 0.6) / TURNS)
         found = _refitted(unfolded, found, tuple(templates), config)
     none = np.zeros(0)
-    notices = fused.notices + fused.given.notices + unfolded.notices
+    notices = told + unfolded.notices
     if badness > DOUBTFUL:
         text = f"no category fits the item well, or it does not lie flat ({badness:.1f})"
         notices = (*notices, Notice("untrusted", text))
@@ -166,7 +168,7 @@ def _rotation(
         start_uv=None,
         lines=GeodesicLines(np.zeros((0, 2, 3)), none.astype(np.int64), none, none, none > 0),
         outline=unfolded.outline,
-        correspondences=fused.given.used,
+        correspondences=given.used,
         notices=notices,
         seen=coverage(unfolded.surface, views),
     )

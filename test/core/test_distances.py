@@ -59,8 +59,8 @@ def test_two_sheets_far_apart_raise():
         measured(twice, np.vstack([normal] * 3))
 
 
-def test_paths_go_round_samples_in_doubt_and_may_end_at_them():
-    xyz, normal, flat = rolled(10.0, width_m=0.2, height_m=0.2)
+def test_distances_past_samples_in_doubt_are_those_of_the_sheet():
+    xyz, normal, flat = rolled(0.1, width_m=0.2, height_m=0.2)
     wall = (np.abs(flat[:, 0] - 0.1) < 0.007) & (flat[:, 1] < 0.12)
     found = measured(xyz, normal, passable=~wall)
     at = flat[found.chosen]
@@ -70,8 +70,9 @@ def test_paths_go_round_samples_in_doubt_and_may_end_at_them():
     tip = np.array([0.1, 0.12])
     round_it = np.linalg.norm(at[left] - tip) + np.linalg.norm(at[right] - tip)
     straight = np.linalg.norm(at[left] - at[right])
-    assert round_it > 1.2 * straight
-    assert 0.97 < found.bound_m[left, right] / round_it < 1.06
+    assert round_it > 1.2 * straight  # the path went round, and was laid out
+    assert found.same_sheet[left, right]
+    assert 0.98 < found.bound_m[left, right] / straight < 1.02
     rim_of_wall = wall & (np.abs(flat[:, 0] - 0.1) > 0.004)
     assert found.inside[rim_of_wall].mean() > 0.9
     assert np.isfinite(found.around_m[found.inside]).any(1).all()

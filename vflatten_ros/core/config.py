@@ -556,9 +556,12 @@ class RotationConfig(Checked):
         low=0.001,
         high=1.0,
     )
+    rim_length_m: float = option(
+        0.12, "Length of rim that must agree for two pieces to be joined, m.", low=0.02, high=10.0
+    )
     landmarks: int = option(300, "Samples whose mutual distances are unfolded.", low=50, high=5000)
     local_m: float = option(
-        0.15, "Nearer pairs on one sheet keep their distance both ways, m.", low=0.01, high=2.0
+        0.25, "Nearer pairs on one sheet keep their distance both ways, m.", low=0.01, high=2.0
     )
     close_m: float = option(
         0.003,

@@ -27,7 +27,8 @@ LEAST_INSIDE = 0.4  # of the samples in the largest piece
 FIRM_LINKS = 6  # links on the sheet that a landmark needs
 GROUP = 16  # landmarks whose paths are laid out together: bounds the memory
 BLOCK = 512  # samples whose nearest landmarks are found together, so that they stay in the cache
-STRAIGHT_LEAST = 0.85  # a chain whose ends are nearer than this share of it went round something
+STRAIGHT_LEAST = 0.4  # a chain whose ends are nearer than this share of it tells too little
+ZIGZAG = 1.03  # how much longer paths over links are than the straight lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +205,16 @@ def surface_distances(
         *_around(walk, min(PLACED_BY, len(chosen) - 1)),
         inside,
     )
+
+
+def link_distances(links: Links, chosen: Int, count: int, reach_m: float) -> Float:
+    """(k, k) lengths of shortest paths over links between landmarks, far ones over near ones."""
+    graph = csr_matrix((links.length_m, (links.a, links.b)), shape=(count, count))
+    near = dijkstra(graph, directed=False, indices=chosen, limit=reach_m)[:, chosen] / ZIGZAG
+    lengths: Float = shortest_path(
+        np.where(np.isfinite(near), near, 0.0), method="D", directed=False
+    )
+    return lengths
 
 
 def pieces(a: Int, b: Int, passable: Bool) -> Int:

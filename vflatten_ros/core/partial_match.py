@@ -23,8 +23,10 @@ SIZES = (0.9, 1.1, 1.4)  # of the whole item's longest extent over the piece's
 ROTATIONS = 24
 
 
-def matches(template: Template, ends: Float, inner: Float, count: int) -> tuple[Float, Float]:
-    """Best poses of typical cuts of a category for a piece of an item.
+def matches(
+    template: Template, ends: Float, inner: Float, count: int, cut: Float | None = None
+) -> tuple[Float, Float]:
+    """Best poses of typical cuts of a category, or of one cut, for a piece of an item.
 
     Parameters
     ----------
@@ -35,6 +37,8 @@ def matches(template: Template, ends: Float, inner: Float, count: int) -> tuple[
         Points spread over the piece.
     count : int
         Poses wanted.
+    cut : ndarray of shape (m,), optional
+        State of the template; typical ones of several sizes by default.
 
     Returns
     -------
@@ -44,8 +48,13 @@ def matches(template: Template, ends: Float, inner: Float, count: int) -> tuple[
     """
     typical = template.outline(np.zeros(template.dimensions))
     extent, own = _diameter(inner), _diameter(typical)
+    if cut is None:
+        cuts = [_scaled(template, np.log(size * extent / own)) for size in SIZES]
+        widest = SIZES[-1] * extent
+    else:
+        cuts, widest = [cut], _diameter(template.outline(cut))
     # wide enough that a piece within one copy of the outline does not feel the next copy
-    span = np.ptp(inner, axis=0) + SIZES[-1] * extent + 2 * CUT_M
+    span = np.ptp(inner, axis=0) + widest + 2 * CUT_M
     shape = tuple(fft.next_fast_len(int(n), real=True) for n in np.ceil(span / CELL_M)[::-1])
     middle = np.array(shape)[::-1] * 0.5 * CELL_M
     low = 0.5 * (inner.min(axis=0) + inner.max(axis=0)) - middle
@@ -53,8 +62,7 @@ def matches(template: Template, ends: Float, inner: Float, count: int) -> tuple[
     parts = _spectra(given)
     angles = np.arange(ROTATIONS) * (2 * np.pi / ROTATIONS)
     poses, states, costs = [], [], []
-    for size in SIZES:
-        state = _scaled(template, np.log(size * extent / own))
+    for state in cuts:
         outline = template.outline(state)
         centre = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
         turned = [(outline - centre) @ _rotation(angle).T + middle for angle in angles]

@@ -4,30 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from vflatten_ros.core.assembly import assemble
 from vflatten_ros.core.automatic_pair import fill_up, flatten_best_pair
 from vflatten_ros.core.config import Config
-from vflatten_ros.core.errors import DisconnectedSurface, NotEnoughViews
+from vflatten_ros.core.errors import NotEnoughViews
+from vflatten_ros.core.hypotheses import likeliest
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.one_view import flatten_one_view
-from vflatten_ros.core.parallel import Ahead, Once
 from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, finish, recognise
 from vflatten_ros.core.registration import ViewSurface, view_surface
-from vflatten_ros.core.rotation import (
-    Fused,
-    Surface,
-    Unfolded,
-    doubts,
-    fuse_views,
-    link_surface,
-    turn_parts,
-    unfold_surface,
-)
+from vflatten_ros.core.rotation import Unfolded, fuse_views, turn_parts
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.two_views import flatten_two_views, named_views
@@ -44,11 +34,7 @@ from vflatten_ros.core.values import (
 )
 
 MOST_JUDGED = 3  # corresponding points given, up to which others are found to judge them
-DOUBTS = (np.inf, 1.0, 0.6, 0.4)  # what is in greater doubt does not join the surface
-ENOUGH = (-0.5, 0.0, 0.0)  # badness below which no more than one, two, three are tried
 DOUBTFUL = 0.3  # badness above which the result is not to be trusted
-STRAYS, MOSTLY_LEFT = 0.06, 0.2  # share that any result leaves out; more that counts as 1
-LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 
 
@@ -147,9 +133,9 @@ def _rotation(
         config.correspondences,
     )
     given, told = fused.given, fused.notices + fused.given.notices
-    unfolded, found = _likeliest(fused, tuple(templates), config, progress)
+    best = likeliest(fused, tuple(templates), config, progress)
     del fused  # its points are many
-    badness = _badness((unfolded, found))
+    unfolded, found, badness = best.unfolded, best.found, best.badness
     for turn in range(TURNS if found.category != UNKNOWN else 0):
         progress("parts", turn / TURNS)
         fit = found.fits[found.category]
@@ -173,69 +159,6 @@ def _rotation(
         seen=coverage(unfolded.surface, views),
     )
     return flattened, found
-
-
-def _likeliest(
-    fused: Fused,
-    templates: tuple[Template, ...],
-    config: Config,
-    progress: Progress,
-) -> tuple[Unfolded, Recognition]:
-    """The surface with and without doubtful places, whichever makes the better item.
-
-    Most items need two tries, so two are made at once, and a result that is not needed is dropped.
-    """
-    linked = Once(partial(link_surface, fused, config.rotation))
-    looked = Once(partial(doubts, fused, config.rotation))
-
-    def laid(doubt: float, progress: Progress) -> tuple[Unfolded, Recognition]:
-        ramps = looked(progress) if np.isfinite(doubt) else None
-        surface = linked(progress)
-        surface = surface if ramps is None else replace(surface, doubt=ramps)
-        return _recognised_as(surface, doubt, templates, config, progress)
-
-    tries: list[tuple[Unfolded, Recognition]] = []
-    failures: list[DisconnectedSurface] = []
-    number, needed = 0, len(DOUBTS)
-    with Ahead([partial(laid, doubt) for doubt in DOUBTS]) as ahead:
-        while number < needed:
-            try:
-                tries.append(ahead.result(number, progress))
-            except DisconnectedSurface as error:
-                failures.append(error)
-            number += 1
-            best = min(map(_badness, tries), default=np.inf)
-            later = range(number, len(DOUBTS))
-            needed = next((k for k in later if best < ENOUGH[k - 1]), len(DOUBTS))
-            ahead.drop(needed)
-    if not tries:
-        raise failures[0]
-    return min(tries, key=_badness)
-
-
-def _recognised_as(
-    surface: Surface,
-    doubt: float,
-    templates: tuple[Template, ...],
-    config: Config,
-    progress: Progress,
-) -> tuple[Unfolded, Recognition]:
-    unfolded = unfold_surface(surface, doubt, config.rotation, progress)
-    outline, points = unfolded.outline, unfolded.points
-    return unfolded, recognise(outline, points, templates, config.recognition, progress)
-
-
-def _badness(tried: tuple[Unfolded, Recognition]) -> float:
-    """How badly the best category fits, how far from flat the item lies, what it leaves out.
-
-    A garment laid flat has one layer of either side everywhere; more say that layers were joined
-    that are not. A piece alone may look like a whole item of another kind.
-    """
-    unfolded, found = tried
-    misfit = found.fit.misfit if found.fit is not None else np.inf
-    folded = max(0.0, unfolded.overlap - LAID) / MOSTLY_LAID
-    left_out = max(0.0, 1.0 - float(unfolded.distances.inside.mean()) - STRAYS) / MOSTLY_LEFT
-    return float(misfit + folded + left_out + (found.category == UNKNOWN))
 
 
 def _described(

@@ -21,12 +21,20 @@ from vflatten_ros.core.fusion import Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.joining import agreeing, find_ties, largest_pieces, near_paths
 from vflatten_ros.core.parallel import mapped
+from vflatten_ros.core.puzzle import overlap as lying_on
 from vflatten_ros.core.ramps import ramps
 from vflatten_ros.core.registration import ViewSurface, register_views, view_surface
 from vflatten_ros.core.sheets import Links, link_samples, sheet_edges
 from vflatten_ros.core.slide import neighbours, slide_m
 from vflatten_ros.core.slide import notice_of as slide_notice
-from vflatten_ros.core.unfolding import carry, orientation, overlap, place_samples, settle, unfold
+from vflatten_ros.core.unfolding import (
+    carry,
+    orientation,
+    overlap,
+    place_samples,
+    settle,
+    unfold,
+)
 from vflatten_ros.core.values import (
     Bool,
     Correspondence,
@@ -81,19 +89,32 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class Unfolded:
-    """The visible surface, flattened."""
+class Part:
+    """Landmarks of what hangs together, flattened."""
 
-    surface: Surface
     distances: Distances
     plane: Float  # (k, 2) places of the distances' landmarks
+
+
+@dataclass(frozen=True, eq=False)
+class Unfolded:
+    """The visible surface or a part of it, flattened."""
+
+    surface: Surface
+    parts: tuple[Part, ...]
     points: FlatPoints  # one measured point near each sample
+    row: Int  # (n,) of the samples
     side: Float  # (n,) 1 outside up, -1 outside down, 0 unclear
+    firm: Bool  # (n,) placed by distances along the sheet
     outline: Outline
-    start_uv: Float  # (n, 2)
     stress_m: float  # rms excess over the distances
     overlap: float  # 0-1, share of the surface that lies on more of the same side
     notices: tuple[Notice, ...]
+
+    @property
+    def share(self) -> float:
+        """Share of all samples that were flattened."""
+        return sum(float(part.distances.inside.mean()) for part in self.parts)
 
 
 def unfold_surface(
@@ -119,7 +140,51 @@ def unfold_surface(
     )
     plane = unfold(distances.bound_m, distances.same_sheet, config, progress)
     progress("outline", 0.0)
-    return _unfolded(surface, distances, plane, config)
+    return unfolded_from(surface, Part(distances, plane), config)
+
+
+def together(
+    groups: Sequence[Unfolded],
+    parts: tuple[Part, ...],
+    points: Sequence[FlatPoints],
+    sides: Sequence[Float],
+    config: RotationConfig,
+) -> Unfolded:
+    surface = groups[0].surface
+    count = np.array([len(p.uv) for p in points])
+    z = [p.uv @ np.array([1, 1j]) for p in points]
+    folded = float(count @ [g.overlap for g in groups]) / count.sum()
+    for j in range(1, len(groups)):
+        here, up = np.concatenate(z[:j]), np.concatenate(sides[:j])
+        folded += lying_on(here, up, z[j], sides[j]) * count[j] / count.sum()
+    all_points = FlatPoints(
+        uv=np.vstack([p.uv for p in points]),
+        xyz_hanger=np.vstack([p.xyz_hanger for p in points]),
+        view_id=np.concatenate([p.view_id for p in points]),
+        pixel=np.vstack([p.pixel for p in points]),
+        sigma_m=np.concatenate([p.sigma_m for p in points]),
+        stress=np.concatenate([p.stress for p in points]),
+        inferred=np.concatenate([p.inferred for p in points]),
+    )
+    row = np.concatenate([g.row for g in groups])
+    firm = np.concatenate([g.firm for g in groups])
+    edge = surface.edge[row][firm]
+    outline = outline_of(all_points.uv[firm], all_points.sigma_m[firm], edge, config)
+    notices = {notice.code: notice for g in groups for notice in g.notices}
+    stress = float(np.sqrt((all_points.stress**2).mean()))
+    side = np.concatenate(sides)
+    return Unfolded(
+        surface,
+        parts,
+        all_points,
+        row,
+        side,
+        firm,
+        outline,
+        stress,
+        folded,
+        tuple(notices.values()),
+    )
 
 
 def _joined(
@@ -127,10 +192,7 @@ def _joined(
 ) -> tuple[Bool, Links]:
     """Samples to go through and links to go along, with the pieces of the surface joined."""
     samples, links = surface.samples, surface.links
-    # noisy or sparse points look like steps anywhere
-    passable = surface.doubt < max(
-        doubt, float(np.quantile(surface.doubt, 1 - MOST_DOUBTFUL / doubt))
-    )
+    passable = passable_at(surface, doubt)
     keep = links.doubt < doubt
     least = int(config.piece * len(samples.xyz))
 
@@ -144,7 +206,7 @@ def _joined(
             break
         ties = find_ties(links, *found[:2])
         rest = links.part(keep)
-        ends = [_laid_flat(surface, rest, piece, config, joining) for piece in found[:2]]
+        ends = [laid_flat(surface, rest, piece, config, joining) for piece in found[:2]]
         one, other = ends[0][ties.one], ends[1][ties.other]
         placed = np.flatnonzero(np.isfinite(one).all(1) & np.isfinite(other).all(1))
         met = placed[agreeing(one[placed], other[placed], ties.length_m[placed])]
@@ -156,7 +218,14 @@ def _joined(
     return passable, links.part(keep)
 
 
-def _laid_flat(
+def passable_at(surface: Surface, doubt: float) -> Bool:
+    """Samples in less doubt; noisy or sparse points look like steps anywhere."""
+    most = float(np.quantile(surface.doubt, 1 - MOST_DOUBTFUL / doubt))
+    passable: Bool = surface.doubt < max(doubt, most)
+    return passable
+
+
+def laid_flat(
     surface: Surface, links: Links, piece: Bool, config: RotationConfig, progress: Progress
 ) -> Float:
     """(n, 2) places of the samples of one piece, roughly; NaN elsewhere."""
@@ -176,10 +245,21 @@ def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationCo
     swung, rest : ndarray of shape (k, 2)
         The template's outline as it fits the item, and with its parts at rest.
     """
-    distances = unfolded.distances
-    plane = carry(unfolded.plane, swung, rest)
-    plane = settle(plane, distances.bound_m, distances.same_sheet, config)
-    return _unfolded(unfolded.surface, distances, plane, config)
+    parts = []
+    for part in unfolded.parts:
+        plane = carry(part.plane, swung, rest)
+        plane = settle(plane, part.distances.bound_m, part.distances.same_sheet, config)
+        parts.append(unfolded_from(unfolded.surface, Part(part.distances, plane), config))
+    if len(parts) == 1:
+        return parts[0]
+    turned, at = [], 0
+    for one in parts:  # as uncertain as they were
+        was = slice(at, at + len(one.row))
+        sigma = np.maximum(one.points.sigma_m, unfolded.points.sigma_m[was])
+        turned.append(replace(one.points, sigma_m=sigma))
+        at += len(one.row)
+    planes = tuple(part for one in parts for part in one.parts)
+    return together(parts, planes, turned, [one.side for one in parts], config)
 
 
 def fuse_views(
@@ -302,11 +382,11 @@ def _edges(samples: Samples, links: Links, config: RotationConfig) -> Int:
     return edge
 
 
-def _unfolded(
-    surface: Surface, distances: Distances, plane: Float, config: RotationConfig
-) -> Unfolded:
-    samples, links = surface.samples, surface.links
-    uv, misfit = place_samples(distances.around, distances.around_m, distances.around_sheet, plane)
+def unfolded_from(surface: Surface, part: Part, config: RotationConfig) -> Unfolded:
+    samples, links, distances = surface.samples, surface.links, part.distances
+    uv, misfit = place_samples(
+        distances.around, distances.around_m, distances.around_sheet, part.plane
+    )
     side = orientation(uv, samples.xyz, samples.normal, links.a, links.b)
     placed = np.isfinite(uv).all(1) & distances.inside
     points = FlatPoints(
@@ -323,7 +403,7 @@ def _unfolded(
     if stress > config.high_stress_m:
         text = f"distances contradict each other by {1e3 * stress:.0f} mm"
         notices.append(Notice("high_stress", text))
-    folded = overlap(plane, distances.bound_m, side[distances.chosen])
+    folded = overlap(part.plane, distances.bound_m, side[distances.chosen])
     if folded > config.untrusted_overlap:
         text = f"{100 * folded:.0f} % of the surface lies on more of its own side: not laid flat"
         notices.append(Notice("untrusted", text))
@@ -333,12 +413,12 @@ def _unfolded(
     outline = outline_of(points.uv[firm], points.sigma_m[firm], surface.edge[placed][firm], config)
     return Unfolded(
         surface,
-        distances,
-        plane,
+        (part,),
         points,
+        np.flatnonzero(placed),
         side[placed],
+        firm,
         outline,
-        points.uv,
         stress,
         folded,
         tuple(notices),

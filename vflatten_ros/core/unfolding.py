@@ -48,11 +48,13 @@ def unfold(
     return plane
 
 
-def settle(plane: Float, bound: Float, near: Bool, config: RotationConfig) -> Float:
-    """Keep bounds and near distances, from where the points are, without spreading any more."""
+def settle(
+    plane: Float, bound: Float, near: Bool, config: RotationConfig, spread: float = 0.0
+) -> Float:
+    """Keep bounds and near distances, from where the points are, without spreading much more."""
     centre, aims = plane.mean(0), _aims(bound, near)
     for _ in range(config.unfold_rounds):
-        plane = _majorise(plane, aims, 0.0)
+        plane = _majorise(plane, aims, spread)
     settled: Float = plane + centre
     return settled
 

@@ -1,0 +1,178 @@
+"""The surface in pieces that are certain, put together as far as their edges tell how.
+
+The stages are those of the whole surface; what joins the pieces is decided here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.distances import link_distances, surface_distances
+from vflatten_ros.core.joining import largest_pieces
+from vflatten_ros.core.puzzle import CELL_M as PUZZLE_CELL_M
+from vflatten_ros.core.puzzle import Motion, Ties, put_together
+from vflatten_ros.core.rotation import (
+    Part,
+    Surface,
+    Unfolded,
+    laid_flat,
+    passable_at,
+    together,
+    unfolded_from,
+)
+from vflatten_ros.core.sheets import Links
+from vflatten_ros.core.unfolding import SPREAD, orientation, settle, unfold
+from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
+
+SMALLEST = 0.01  # share of the samples that makes a piece
+SMALL_GROUP, SMALL_LANDMARKS = 0.15, 150
+RIM_SLACK_M = 0.004  # between the two sides of a rim
+RIM_STEP_M = 0.012  # rims nearer than this are of one stretch
+RIM_SHARE = 0.2  # of a stretch of rim that agrees, for all of it to be believed
+
+
+@dataclass(frozen=True, eq=False)
+class Grouped:
+    """The surface in pieces that were put together as far as their edges tell how."""
+
+    surface: Surface
+    links: Links  # on the sheets, and round the rims that join pieces
+    all_links: Links  # round all other rims of one piece, too
+    masks: tuple[Bool, ...]  # (n,) samples of each group, largest first
+
+
+def group_pieces(
+    surface: Surface, doubt: float, config: RotationConfig, progress: Progress = no_progress
+) -> Grouped:
+    """What hangs together on sheets, and is joined by rims that agree.
+
+    Parameters
+    ----------
+    surface : Surface
+    doubt : float
+        What is more doubtful than this joins nothing.
+    """
+    samples, links = surface.samples, surface.links
+    passable, sheet = passable_at(surface, doubt), links.part(~links.rim)
+    found = largest_pieces(sheet, passable, int(SMALLEST * len(samples.xyz)))
+    flat = []
+    for k, piece in enumerate(found):
+
+        def flattening(_: str, fraction: float, done: int = k) -> None:
+            progress("pieces", (done + fraction) / len(found))
+
+        flat.append(laid_flat(surface, sheet, piece, config, flattening))
+    sides = [
+        orientation(np.nan_to_num(uv), samples.xyz, samples.normal, sheet.a, sheet.b) for uv in flat
+    ]
+    number = np.full(len(samples.xyz), -1)
+    for k, piece in enumerate(found):
+        number[piece] = k
+    a, b = number[links.a], number[links.b]
+    between = np.flatnonzero(links.rim & (a >= 0) & (b >= 0) & (a != b))
+    ties = Ties(links.a[between], links.b[between], np.full(len(between), RIM_SLACK_M))
+    puzzle = put_together(found, flat, sides, ties, round(config.rim_length_m / PUZZLE_CELL_M))
+    believed = np.zeros(len(a), dtype=bool)
+    believed[between] = _along_agreeing(samples.xyz, ties, a[between], b[between], puzzle.met)
+    size = np.bincount(puzzle.group[puzzle.group >= 0])
+    order = [k for k in np.argsort(-size, kind="stable") if size[k] > SMALLEST * len(number)]
+    masks = tuple(puzzle.group == k for k in order)
+    own = links.rim & (a == b) & (a >= 0)
+    return Grouped(
+        surface, links.part(~links.rim | believed), links.part(~links.rim | believed | own), masks
+    )
+
+
+def _along_agreeing(xyz: Float, ties: Ties, a: Int, b: Int, met: Bool) -> Bool:
+    """Ties of two pieces along the same stretch of rim as those that agree.
+
+    A tube does not lie quite flat until both its rims are joined, so many right ones do not agree.
+    """
+    if not len(met):
+        return met
+    middle = (xyz[ties.one] + xyz[ties.other]) / 2
+    i, j = cKDTree(middle).query_pairs(RIM_STEP_M, output_type="ndarray").T
+    pair = np.minimum(a, b) * (a.max() + b.max() + 1) + np.maximum(a, b)
+    alike = pair[i] == pair[j]
+    ones = np.ones(int(alike.sum()), dtype=bool)
+    graph = csr_matrix((ones, (i[alike], j[alike])), shape=(len(met), len(met)))
+    stretch = connected_components(graph, directed=False)[1]
+    share = np.bincount(stretch, met) / np.bincount(stretch)
+    believed: Bool = share[stretch] > RIM_SHARE
+    return believed
+
+
+def unfold_group(
+    grouped: Grouped,
+    which: int,
+    closed: bool,
+    config: RotationConfig,
+    progress: Progress = no_progress,
+) -> Unfolded:
+    """Flatten one group.
+
+    Parameters
+    ----------
+    grouped : Grouped
+    which : int
+        The group.
+    closed : bool
+        Believe rims of one piece, too, and begin with what all links give, wrong ones as well: it
+        keeps tubes closed that the group's own distances leave open. Otherwise begin spread out.
+
+    Raises
+    ------
+    DisconnectedSurface
+    """
+    surface, mask = grouped.surface, grouped.masks[which]
+    samples = surface.samples
+    if mask.mean() < SMALL_GROUP:
+        config = replace(config, landmarks=min(config.landmarks, SMALL_LANDMARKS))
+    links = grouped.all_links if closed else grouped.links
+    distances = surface_distances(
+        samples.xyz, samples.normal, links, mask, config, progress, surface.steps
+    )
+    bound, near = distances.bound_m, distances.same_sheet
+    if closed:
+        everything = link_distances(surface.links, distances.chosen, len(mask), config.local_m)
+        plane = unfold(np.minimum(everything, bound), near, config, progress)
+        plane = settle(plane, bound, near, config, SPREAD[-1])
+    else:
+        plane = unfold(bound, near, config, progress)
+    progress("outline", 0.0)
+    return unfolded_from(surface, Part(distances, plane), config)
+
+
+def put_beside(
+    groups: Sequence[Unfolded], motions: Sequence[Motion], sigma_m: float, config: RotationConfig
+) -> Unfolded:
+    """Several groups in one plane.
+
+    Parameters
+    ----------
+    groups : sequence of Unfolded
+    motions : sequence of Motion
+        Of their planes.
+    sigma_m : float
+        How far the places of all but the first may be off.
+    """
+    parts, points, sides = [], [], []
+    for k, (group, motion) in enumerate(zip(groups, motions, strict=True)):
+        moved = [Part(part.distances, _moved(part.plane, motion)) for part in group.parts]
+        parts.extend(moved)
+        sigma = np.hypot(group.points.sigma_m, sigma_m if k else 0.0)
+        points.append(replace(group.points, uv=_moved(group.points.uv, motion), sigma_m=sigma))
+        sides.append(-group.side if motion.mirrored else group.side)
+    return together(groups, tuple(parts), points, sides, config)
+
+
+def _moved(uv: Float, motion: Motion) -> Float:
+    z = motion(uv @ np.array([1, 1j]))
+    return np.column_stack([z.real, z.imag])

@@ -142,7 +142,8 @@ def unfold_group(
     bound, near = distances.bound_m, distances.same_sheet
     if closed:
         everything = link_distances(surface.links, distances.chosen, len(mask), config.local_m)
-        plane = unfold(np.minimum(everything, bound), near, config, progress)
+        rough = replace(config, unfold_rounds=max(1, config.unfold_rounds // 2))
+        plane = unfold(np.minimum(everything, bound), near, rough, progress)
         plane = settle(plane, bound, near, config, SPREAD[-1])
     else:
         plane = unfold(bound, near, config, progress)

@@ -55,6 +55,7 @@ HIDDEN_SHARE = 0.75  # of the edges there that are hidden, above which it is no 
 SPUR_M = 0.012  # half the width of what is too narrow for a garment
 SPUR_REACH = 0.8  # how far a corner goes beyond a disc in it, in radii
 ROUGH, ROUGH_ROUNDS = 120, 4  # landmarks and reweightings where pieces are laid flat by themselves
+FEWEST, ROUGH_SPACING = 50, 40  # landmarks of a small piece, and samples for each
 MOST_JOINS = 3
 MOST_DOUBTFUL = 0.1  # of the samples, at a doubt of 1
 TOLD_M = 1e-4  # length of a link between samples that are said to be one point of the cloth
@@ -229,12 +230,18 @@ def laid_flat(
     surface: Surface, links: Links, piece: Bool, config: RotationConfig, progress: Progress
 ) -> Float:
     """(n, 2) places of the samples of one piece, roughly; NaN elsewhere."""
-    rough = replace(config, landmarks=ROUGH, unfold_rounds=ROUGH_ROUNDS)
-    xyz, normal = surface.samples.xyz, surface.samples.normal
-    distances = surface_distances(xyz, normal, links, piece, rough, progress, surface.steps)
+    rows = np.flatnonzero(piece)
+    few = min(ROUGH, max(FEWEST, len(rows) // ROUGH_SPACING))
+    rough = replace(config, landmarks=few, unfold_rounds=ROUGH_ROUNDS)
+    xyz, normal = surface.samples.xyz[rows], surface.samples.normal[rows]
+    alone = links.among(piece)
+    everywhere = np.ones(len(rows), dtype=bool)
+    distances = surface_distances(xyz, normal, alone, everywhere, rough, progress)
     plane = unfold(distances.bound_m, distances.same_sheet, rough, progress)
     uv = place_samples(distances.around, distances.around_m, distances.around_sheet, plane)[0]
-    return np.where(distances.inside[:, None], uv, np.nan)
+    places = np.full((len(piece), 2), np.nan)
+    places[rows[distances.inside]] = uv[distances.inside]
+    return places
 
 
 def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationConfig) -> Unfolded:

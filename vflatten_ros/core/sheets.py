@@ -36,6 +36,12 @@ class Links:
             self.a[keep], self.b[keep], self.length_m[keep], self.rim[keep], self.doubt[keep]
         )
 
+    def among(self, some: Bool) -> Links:
+        """Links between some of the (n,) samples, numbered as these alone are."""
+        number = np.cumsum(some) - 1
+        kept = self.part(some[self.a] & some[self.b])
+        return Links(number[kept.a], number[kept.b], kept.length_m, kept.rim, kept.doubt)
+
     def with_links(self, a: Int, b: Int, length_m: float) -> Links:
         """With links on one sheet between some pairs of samples, in place of what was there."""
         if not len(a):

@@ -81,6 +81,17 @@ def test_front_and_back_of_a_shirt_are_put_together_by_their_hems():
     assert found.met[len(one) :].mean() < 0.1
 
 
+def test_round_a_straight_rim_lies_the_other_side_of_the_cloth():
+    flat, number, side = shirt()
+    one, other = hem_ties(flat, number)
+    bottom = (number[other] == 1) & (flat[one, 1] < 0.003)
+    found = put(flat, number, side, one[bottom], other[bottom], least=8)
+    back = number == 1
+    assert (found.group[back] == 0).all()
+    assert (found.side[back] == -1.0).all()
+    assert np.abs(found.z[back] - flat[back] @ np.array([1, 1j])).max() < 0.02
+
+
 def test_a_short_contact_joins_nothing():
     flat, number, side = shirt()
     one, other = hem_ties(flat, number)
@@ -93,12 +104,17 @@ def test_a_short_contact_joins_nothing():
 def test_a_piece_does_not_come_to_lie_on_the_same_side_of_another():
     flat, number, side = shirt()
     one, other = hem_ties(flat, number)
-    uv, up = laid_apart(flat, number, side)
-    turned = [up[0], -up[1], up[2]]  # its outside is where its inside was
-    ties = Ties(one, other, np.full(len(one), SLACK_M))
-    found = put_together([number == k for k in range(3)], uv, turned, ties, 12)
-    assert (found.group[number == 1] == 1).all()
-    assert (found.group[number == 2] == 0).all()
+    left = number[other] == 1
+    # where the left back is, the right back fits as well
+    false = [
+        int(
+            np.where(number == 2, np.abs(flat - [0.16, 0.0] - flat[i]).max(axis=1), np.inf).argmin()
+        )
+        for i in other[left][::2]
+    ]
+    found = put(flat, number, side, np.r_[one[left], one[left][::2]], np.r_[other[left], false])
+    assert (found.group[number == 1] == 0).all()
+    assert (found.group[number == 2] == 2).all()
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -110,7 +126,7 @@ def test_the_motion_that_most_ties_agree_on_is_found(mirrored):
     other = back.conj() if mirrored else back
     wrong = np.arange(80) % 3 == 0
     other[wrong] = rng.uniform(-0.3, 0.3, wrong.sum()) + 1j * rng.uniform(-0.3, 0.3, wrong.sum())
-    met, motion, places = agreeing(one, other, np.full(80, SLACK_M))
+    met, motion, places = agreeing(one, other, np.full(80, SLACK_M), mirrored)
     assert met[~wrong].all() and met[wrong].mean() < 0.2
     assert motion.mirrored == mirrored
     assert np.abs(motion(other[~wrong]) - one[~wrong]).max() < 0.003
@@ -119,7 +135,7 @@ def test_the_motion_that_most_ties_agree_on_is_found(mirrored):
 
 def test_ties_in_one_place_tell_no_direction():
     one = np.zeros(6, dtype=complex) + 0.001 * np.arange(6)
-    assert agreeing(one, one + 0.1, np.full(6, SLACK_M))[2] == 0
+    assert agreeing(one, one + 0.1, np.full(6, SLACK_M), False)[2] == 0
 
 
 def test_overlap_counts_the_same_side_only():

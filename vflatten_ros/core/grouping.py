@@ -31,6 +31,7 @@ from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.unfolding import SPREAD, orientation, settle, unfold
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
+PUZZLE, CLOSED, SPREAD_OUT = "puzzle", "closed", "spread"
 SMALLEST = 0.01  # share of the samples that makes a piece
 SMALL_GROUP, SMALL_LANDMARKS = 0.15, 150
 RIM_SLACK_M = 0.004  # between the two sides of a rim
@@ -46,6 +47,7 @@ class Grouped:
     links: Links  # on the sheets, and round the rims that join pieces
     all_links: Links  # round all other rims of one piece, too
     masks: tuple[Bool, ...]  # (n,) samples of each group, largest first
+    places: Float  # (n, 2) as the pieces were put together; NaN in none
 
 
 def group_pieces(
@@ -86,7 +88,11 @@ def group_pieces(
     masks = tuple(puzzle.group == k for k in order)
     own = links.rim & (a == b) & (a >= 0)
     return Grouped(
-        surface, links.part(~links.rim | believed), links.part(~links.rim | believed | own), masks
+        surface,
+        links.part(~links.rim | believed),
+        links.part(~links.rim | believed | own),
+        masks,
+        np.column_stack([puzzle.z.real, puzzle.z.imag]),
     )
 
 
@@ -112,7 +118,7 @@ def _along_agreeing(xyz: Float, ties: Ties, a: Int, b: Int, met: Bool) -> Bool:
 def unfold_group(
     grouped: Grouped,
     which: int,
-    closed: bool,
+    start: str,
     config: RotationConfig,
     progress: Progress = no_progress,
 ) -> Unfolded:
@@ -135,15 +141,18 @@ def unfold_group(
     samples = surface.samples
     if mask.mean() < SMALL_GROUP:
         config = replace(config, landmarks=min(config.landmarks, SMALL_LANDMARKS))
-    links = grouped.all_links if closed else grouped.links
+    links = grouped.all_links if start == CLOSED else grouped.links
     distances = surface_distances(
         samples.xyz, samples.normal, links, mask, config, progress, surface.steps
     )
     bound, near = distances.bound_m, distances.same_sheet
-    if closed:
+    if start == CLOSED:
         everything = link_distances(surface.links, distances.chosen, len(mask), config.local_m)
         rough = replace(config, unfold_rounds=max(1, config.unfold_rounds // 2))
         plane = unfold(np.minimum(everything, bound), near, rough, progress)
+        plane = settle(plane, bound, near, config, SPREAD[-1])
+    elif start == PUZZLE:
+        plane = grouped.places[distances.chosen]
         plane = settle(plane, bound, near, config, SPREAD[-1])
     else:
         plane = unfold(bound, near, config, progress)

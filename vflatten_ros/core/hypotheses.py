@@ -14,7 +14,15 @@ import numpy as np
 
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface
-from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold_group
+from vflatten_ros.core.grouping import (
+    CLOSED,
+    PUZZLE,
+    SPREAD_OUT,
+    Grouped,
+    group_pieces,
+    put_beside,
+    unfold_group,
+)
 from vflatten_ros.core.parallel import Ahead, Once
 from vflatten_ros.core.placing import Group, place_groups
 from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
@@ -29,19 +37,23 @@ from vflatten_ros.core.rotation import (
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import Progress
 
-WHOLE, CLOSED, SPREAD = "whole", "closed", "spread"
+WHOLE = "whole"
 WAYS = (  # how, greatest doubt, badness of what was tried before below which it is left out
     (WHOLE, np.inf, -np.inf),
-    (CLOSED, 1.0, -0.5),
-    (SPREAD, 1.0, -0.2),
+    (PUZZLE, 1.0, -0.5),
+    (CLOSED, 1.0, -0.2),
+    (SPREAD_OUT, 1.0, -0.2),
     (WHOLE, 1.0, 0.0),
+    (PUZZLE, 0.6, 0.0),
     (CLOSED, 0.6, 0.0),
     (WHOLE, 0.6, 0.0),
+    (PUZZLE, 0.4, 0.0),
     (CLOSED, 0.4, 0.0),
-    (SPREAD, 0.4, 0.0),
+    (SPREAD_OUT, 0.4, 0.0),
 )
-STRAYS, MOSTLY_LEFT = 0.06, 0.2  # share that any result leaves out; more that counts as 1
+STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
+EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
 WORTH_PLACING = 0.1  # share of the samples of a group
 PLACED_WAYS = 2  # categories by which groups are placed that are looked at
 
@@ -63,7 +75,9 @@ class Tried:
         misfit = self.found.fit.misfit if self.found.fit is not None else np.inf
         folded = max(0.0, self.unfolded.overlap - LAID) / MOSTLY_LAID
         left_out = max(0.0, 1.0 - self.unfolded.share - STRAYS) / MOSTLY_LEFT
-        return float(misfit + folded + left_out + (self.found.category == UNKNOWN))
+        explained = self.found.fit.explained if self.found.fit is not None else 0.0
+        odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD
+        return float(misfit + folded + left_out + odd + (self.found.category == UNKNOWN))
 
 
 def likeliest(
@@ -100,7 +114,7 @@ def likeliest(
             unfolded = unfold_surface(whole, doubt, config.rotation, progress)
             return _recognised(unfolded, templates, config, progress)
         groups = grouped[doubt](progress)
-        return _from_groups(groups, how == CLOSED, templates, config, progress)
+        return _from_groups(groups, how, templates, config, progress)
 
     ways = [(enough, partial(tried, how, doubt)) for how, doubt, enough in WAYS]
     return _first_good(ways, progress)
@@ -131,14 +145,14 @@ def _first_good(
 
 def _from_groups(
     grouped: Grouped,
-    closed: bool,
+    start: str,
     templates: tuple[Template, ...],
     config: Config,
     progress: Progress,
 ) -> Tried:
     """The largest group by itself, or with the others placed beside it, whichever is better."""
     which = [k for k, mask in enumerate(grouped.masks) if k == 0 or mask.mean() > WORTH_PLACING]
-    laid = [unfold_group(grouped, k, closed or k > 0, config.rotation, progress) for k in which]
+    laid = [unfold_group(grouped, k, start, config.rotation, progress) for k in which]
     tries = [_recognised(laid[0], templates, config, progress)]
     if len(laid) > 1:
         groups = [Group(one.points, one.side, one.outline) for one in laid]

@@ -97,7 +97,9 @@ def put_together(
             rows = np.flatnonzero((np.minimum(a, b) == pair[0]) & (np.maximum(a, b) == pair[1]))
             first = np.where(a[rows] == pair[0], ties.one[rows], ties.other[rows])
             second = np.where(a[rows] == pair[0], ties.other[rows], ties.one[rows])
-            agree, motion, places_ = agreeing(z[first], z[second], ties.slack_m[rows])
+            # round a rim lie the two sides of the cloth; along a straight one nothing else tells
+            mirrored = float((up[first] * up[second]).sum()) > 0.0
+            agree, motion, places_ = agreeing(z[first], z[second], ties.slack_m[rows], mirrored)
             mask = np.zeros(len(ties.one), dtype=bool)
             mask[rows[agree]] = True
             found[pair] = places_, mask, motion
@@ -120,7 +122,9 @@ def put_together(
     return Puzzle(z, up, group, met)
 
 
-def agreeing(one: Complex, other: Complex, slack_m: Float) -> tuple[Bool, Motion, int]:
+def agreeing(
+    one: Complex, other: Complex, slack_m: Float, mirrored: bool
+) -> tuple[Bool, Motion, int]:
     """The rigid motion of the others' plane that meets ties in the most places.
 
     Random pairs of ties are tried (Fischler and Bolles 1981), the same ones every time.
@@ -131,6 +135,8 @@ def agreeing(one: Complex, other: Complex, slack_m: Float) -> tuple[Bool, Motion
         Ends of the ties in the planes of either.
     slack_m : ndarray of shape (t,)
         How far apart the ends may be.
+    mirrored : bool
+        Whether the motion turns the others' plane over.
 
     Returns
     -------
@@ -151,18 +157,14 @@ def agreeing(one: Complex, other: Complex, slack_m: Float) -> tuple[Bool, Motion
     i, along, against = i[alike][:TRIALS], along[alike][:TRIALS], against[alike][:TRIALS]
     if not len(i):
         return nothing
-    best = -1.0, Motion(False, 1.0, 0.0)
-    for mirrored in (False, True):
-        there = q.conj() if mirrored else q
-        turn = along / (against.conj() if mirrored else against)
-        turn /= np.abs(turn)
-        shift = p[i] - turn * there[i]
-        off = np.abs(turn[:, None] * there + shift[:, None] - p)
-        score = (np.clip(1.0 - off / (AGREE_M + slack), 0.0, None) ** 0.5).sum(1)
-        k = int(score.argmax())
-        if score[k] > best[0]:
-            best = float(score[k]), Motion(mirrored, complex(turn[k]), complex(shift[k]))
-    motion = best[1]
+    there = q.conj() if mirrored else q
+    turn = along / (against.conj() if mirrored else against)
+    turn /= np.abs(turn)
+    shift = p[i] - turn * there[i]
+    off = np.abs(turn[:, None] * there + shift[:, None] - p)
+    score = (np.clip(1.0 - off / (AGREE_M + slack), 0.0, None) ** 0.5).sum(1)
+    k = int(score.argmax())
+    motion = Motion(mirrored, complex(turn[k]), complex(shift[k]))
     for _ in range(ROUNDS):
         met = np.abs(motion(other) - one) < AGREE_M + slack_m
         if met.sum() < 2:

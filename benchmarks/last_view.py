@@ -48,7 +48,8 @@ that of the try which was waited for.
 TOGETHER = {
     "register, fuse": ("surface", "register", "fuse"),
     "link, ramps": ("link", "ramps"),
-    "join, distances, unfold": ("join", "distances", "unfold"),
+    "pieces, distances, unfold": ("join", "pieces", "distances", "unfold"),
+    "place": ("place",),
     "outline, recognition": ("outline", "recognition"),
     "parts, measurement": ("parts", "measurement"),
 }

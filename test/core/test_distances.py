@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.distances import surface_distances
+from vflatten_ros.core.distances import link_distances, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.sheets import link_samples
 
@@ -76,3 +76,23 @@ def test_distances_past_samples_in_doubt_are_those_of_the_sheet():
     rim_of_wall = wall & (np.abs(flat[:, 0] - 0.1) > 0.004)
     assert found.inside[rim_of_wall].mean() > 0.9
     assert np.isfinite(found.around_m[found.inside]).any(1).all()
+
+
+def test_lengths_over_links_are_nearly_straight_far_apart_too():
+    xyz, normal, flat = rolled(0.1, width_m=0.4)
+    links = link_samples(xyz, normal, CONFIG)
+    chosen = np.arange(0, len(xyz), 50)
+    found = link_distances(links, chosen, len(xyz), reach_m=0.1)
+    true = np.linalg.norm(flat[chosen][:, None] - flat[chosen][None], axis=2)
+    far = true > 0.25  # several times the reach
+    assert 0.97 < np.median(found[far] / true[far]) < 1.05
+    assert np.isfinite(found).all()
+
+
+def test_links_among_some_samples_are_those_of_these_samples_alone():
+    xyz, normal, flat = rolled(10.0, width_m=0.1, height_m=0.1)
+    some = flat[:, 0] < 0.05
+    among = link_samples(xyz, normal, CONFIG).among(some)
+    assert len(among.a) > 500
+    length = np.linalg.norm(xyz[some][among.a] - xyz[some][among.b], axis=1)
+    assert np.abs(length - among.length_m).max() < 1e-3

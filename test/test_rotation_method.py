@@ -59,9 +59,7 @@ def test_category_sizes_and_places_come_out_right(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "counts", "enough"), [("SK2_1", (8, 12), True), ("LS1_1", (22,), True)]
-)
+@pytest.mark.parametrize(("name", "counts", "enough"), [("SK2_1", (8, 12), True)])
 def test_views_in_order_are_enough_once_the_answer_is_right_and_not_before(name, counts, enough):
     category = None
     for count in counts:

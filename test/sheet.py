@@ -14,24 +14,32 @@ ANGLES_RAD = (-0.7, 0.7)  # the sheet's sides turn more than 90 degrees away
 
 
 def seen_from(
-    view_id: int, angle_rad: float, rows=480, cols=360, focal=520.0, colour=None, noise=0.0
+    view_id: int,
+    angle_rad: float,
+    rows=480,
+    cols=360,
+    focal=520.0,
+    colour=None,
+    noise=0.0,
+    size=(RADIUS_M, WIDTH_M, HEIGHT_M),
 ):
     """The sheet where the rays of the camera meet it, and its flat places.
 
-    `colour` takes (n, 2) flat places to (n,) grey values.
+    `size`: radius, width and height, m. `colour` takes (n, 2) flat places to (n,) grey values.
     """
+    radius_m, width_m, height_m = size
     T_rig_hanger = CALIBRATION.T_rig_hanger(angle_rad)
     row, col = (v.ravel() for v in np.mgrid[0:rows, 0:cols])
     ray = np.c_[(col - (cols - 1) / 2) / focal, (row - (rows - 1) / 2) / focal, np.ones(len(row))]
     eye = -T_rig_hanger[:3, :3].T @ T_rig_hanger[:3, 3]
     way = ray @ T_rig_hanger[:3, :3]
     a, b = (way[:, :2] ** 2).sum(1), way[:, :2] @ eye[:2]
-    root = b**2 - a * (eye[:2] @ eye[:2] - RADIUS_M**2)
+    root = b**2 - a * (eye[:2] @ eye[:2] - radius_m**2)
     met = root > 0
     depth = (-b[met] - np.sqrt(root[met])) / a[met]
     at = eye + depth[:, None] * way[met]
-    u, v = RADIUS_M * np.arctan2(at[:, 1], at[:, 0]), at[:, 2] + BELOW_TIP_M
-    inside = (np.abs(u) < WIDTH_M / 2) & (v < 0) & (v > -HEIGHT_M)
+    u, v = radius_m * np.arctan2(at[:, 1], at[:, 0]), at[:, 2] + BELOW_TIP_M
+    inside = (np.abs(u) < width_m / 2) & (v < 0) & (v > -height_m)
     pixel = np.c_[row[met], col[met]][inside].astype(np.int32)
     points = transform_points(T_rig_hanger, at[inside])
     flat = np.c_[u, v][inside]

@@ -2,34 +2,18 @@
 
 import numpy as np
 import pytest
-from garments import BELOW_TIP_M, CALIBRATION, HEIGHT_M, RADIUS_M, WIDTH_M, example_view
+from garments import HEIGHT_M, RADIUS_M, WIDTH_M, example_view
+from sheet import seen_from
 
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface
-from vflatten_ros.core.geometry import transform_points
 from vflatten_ros.core.one_view import flatten_one_view
 from vflatten_ros.core.values import View
 
 
 def seen_by_camera(rows=480, cols=360, focal=520.0, width_m=WIDTH_M):
     """The towel of garments.py, exactly where the camera's rays meet it, and its flat places."""
-    # rays against the cylinder x^2 + y^2 = r^2 in the hanger frame at item angle 0
-    T_rig_hanger = CALIBRATION.T_rig_hanger(0.0)
-    row, col = (v.ravel() for v in np.mgrid[0:rows, 0:cols])
-    ray = np.c_[(col - (cols - 1) / 2) / focal, (row - (rows - 1) / 2) / focal, np.ones(len(row))]
-    eye = -T_rig_hanger[:3, :3].T @ T_rig_hanger[:3, 3]
-    way = ray @ T_rig_hanger[:3, :3]
-    a, b = (way[:, :2] ** 2).sum(1), way[:, :2] @ eye[:2]
-    root = b**2 - a * (eye[:2] @ eye[:2] - RADIUS_M**2)
-    met = root > 0
-    depth = (-b[met] - np.sqrt(root[met])) / a[met]
-    at = eye + depth[:, None] * way[met]
-    u, v = RADIUS_M * np.arctan2(at[:, 1], at[:, 0]), at[:, 2] + BELOW_TIP_M
-    inside = (np.abs(u) < width_m / 2) & (v < 0) & (v > -HEIGHT_M)
-    pixel = np.c_[row[met], col[met]][inside].astype(np.int32)
-    points = transform_points(T_rig_hanger, at[inside])
-    flat = np.c_[u, v][inside]
-    return View(3, 0, 0.0, points, pixel, None, (rows, cols), CALIBRATION), flat
+    return seen_from(3, 0.0, rows, cols, focal, size=(RADIUS_M, width_m, HEIGHT_M))
 
 
 def test_a_bent_sheet_comes_out_as_its_rectangle():

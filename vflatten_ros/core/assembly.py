@@ -20,8 +20,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import AssemblyConfig, Config, ContourConfig
 from vflatten_ros.core.contour import trace_outline
-from vflatten_ros.core.evidence import CELL_M as EVIDENCE_CELL_M
-from vflatten_ros.core.evidence import Evidence, evidence_from
+from vflatten_ros.core.evidence import Evidence, evidence_from, robust_mean, seen_beside
 from vflatten_ros.core.partial_match import matches
 from vflatten_ros.core.template_fit import linearise, place, refine
 from vflatten_ros.core.templates import Template
@@ -485,20 +484,8 @@ def _ends_evidence(
         inner=inner,
         inner_sigma=np.full(len(inner), np.hypot(config.assembly.sigma_m, recognition.misfit_m)),
         inner_weight=np.full(len(inner), 0.5 * prepared.main.total / len(inner)),
-        seen=_seen(union, uv),
+        seen=seen_beside(union, uv),
     )
-
-
-def _seen(union: Evidence, ends: Float) -> Float:
-    """Where the template's outline must lie on the seen one: not where two pieces' ends meet."""
-    cell = np.rint((ends - union.origin) / EVIDENCE_CELL_M).astype(int)
-    rows, cols = union.distance.shape
-    col, row = np.clip(cell, 0, [cols - 1, rows - 1]).T
-    within = union.distance[row, col] < -CELL_M
-    free = np.ones((rows, cols), np.uint8)
-    free[row[within], col[within]] = 0
-    away = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * EVIDENCE_CELL_M
-    return np.where(away < 0.06, 0.0, union.seen)
 
 
 def _best_turn(
@@ -553,8 +540,8 @@ def _costs(
     off = _look_up(images, images.signed, _all_turned(trials, ends)) / sigma
     out = np.maximum(_look_up(images, images.signed, inside), 0.0) / sigma
     over = np.maximum(_look_up(images, images.taken, inside) - config.overlap_m, 0.0) / sigma
-    fit = config.end_weight * _soft(off, 3.0) + config.inner_weight * _soft(out, 3.0)
-    beside = config.overlap_weight * _soft(over, 6.0)
+    fit = config.end_weight * robust_mean(off, 3.0) + config.inner_weight * robust_mean(out, 3.0)
+    beside = config.overlap_weight * robust_mean(over, 6.0)
     return np.stack([fit, beside + 0.5 * (shift**2).sum(axis=1)])
 
 
@@ -564,11 +551,6 @@ def _all_turned(trials: Float, uv: Float) -> Float:
     arm = (uv[None] - moving[:, None]) @ np.array([1.0, 1j]) * np.exp(1j * angle)[:, None]
     result: Float = np.stack([arm.real, arm.imag], axis=-1) + fixed[:, None]
     return result
-
-
-def _soft(off: Float, cut: float) -> Float:
-    out: Float = (0.5 * off**2 / (1.0 + (off / cut) ** 2)).mean(axis=-1)
-    return out
 
 
 def _look_up(images: _Images, image: Float, uv: Float) -> Float:

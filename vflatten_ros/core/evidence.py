@@ -21,6 +21,7 @@ RIM_M = 0.03  # flattened points nearer than this to the outline, or outside, bo
 MOST_INFERRED = 0.6  # if more than this is, the flags say too little to go by
 GAP_M = 0.05  # widest gap between parts of an item, as between its legs
 GAP_WEIGHT = 4.0  # of an outline along such a gap: cloth that no view shows is not missing so
+MEETING_M = 0.06  # beyond where pieces meet their outline need not be that of the item
 MOST_LINKED = 6000  # flattened points that are linked to find gaps
 
 
@@ -209,6 +210,35 @@ def _distance_image(
     of_label = np.zeros(label.max() + 1)
     of_label[label[row, col]] = trusted[nearest]
     return distance, np.stack([right, down], axis=-1), of_label[label]
+
+
+def seen_beside(evidence: Evidence, ends: Float) -> Float:
+    """Where a template must lie on the seen outline: not near where two pieces' ends meet.
+
+    Parameters
+    ----------
+    ends : ndarray of shape (n, 2)
+        Of all pieces, m; those amid the cloth of the evidence meet others.
+
+    Returns
+    -------
+    ndarray of shape (rows, cols)
+        As Evidence.seen.
+    """
+    cell = np.rint((ends - evidence.origin) / CELL_M).astype(int)
+    rows, cols = evidence.distance.shape
+    col, row = np.clip(cell, 0, [cols - 1, rows - 1]).T
+    within = evidence.distance[row, col] < -CELL_M
+    free = np.ones((rows, cols), np.uint8)
+    free[row[within], col[within]] = 0
+    away = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * CELL_M
+    return np.where(away < MEETING_M, 0.0, evidence.seen)
+
+
+def robust_mean(off: Float, cut: float) -> Float:
+    """(...,) mean over the last axis of halves of squared residuals (in sigmas), levelling off."""
+    out: Float = (0.5 * off**2 / (1.0 + (off / cut) ** 2)).mean(axis=-1)
+    return out
 
 
 def sample(image: Float, cell: Float) -> Float:

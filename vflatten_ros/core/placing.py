@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vflatten_ros.core.config import AssemblyConfig, Config
-from vflatten_ros.core.evidence import CELL_M as EVIDENCE_CELL_M
-from vflatten_ros.core.evidence import Evidence, evidence_from
+from vflatten_ros.core.evidence import Evidence, evidence_from, robust_mean, seen_beside
 from vflatten_ros.core.partial_match import matches
 from vflatten_ros.core.puzzle import Complex, Motion
 from vflatten_ros.core.template_fit import place, refine
@@ -29,7 +28,6 @@ COARSE, CUTS = (12.0, 9.0), (6.0, 5.0, 4.0, 3.0, 3.0, 3.0)  # of the fits of the
 MOST_FITS, KEPT, WAYS = 8, 4, 2  # of a category: tried, refined, kept
 PLACES = 6  # of a group, either way up, that are refined
 STIFF = 0.05  # of the swing that is allowed: the groups are rigid
-FREE_M = 0.06  # beyond ends amid cloth the outline need not be seen
 NEAR_M = 0.02  # beyond the main group's outline
 END_SIGMA_M = 0.002
 STEPS = np.array([np.radians(8.0), 0.02, 0.02])  # of the search round a place: turn, shift
@@ -238,13 +236,8 @@ def _costs(
         _look_up(images.low, images.taken[1], inner),
     )
     over = np.maximum(depth - config.overlap_m, 0.0) * (up != 0) / sigma
-    fit = config.end_weight * _soft(off, 3.0) + config.inner_weight * _soft(out, 3.0)
-    return np.stack([fit, config.overlap_weight * _soft(over, 6.0)])
-
-
-def _soft(off: Float, cut: float) -> Float:
-    out: Float = (0.5 * off**2 / (1.0 + (off / cut) ** 2)).mean(axis=-1)
-    return out
+    fit = config.end_weight * robust_mean(off, 3.0) + config.inner_weight * robust_mean(out, 3.0)
+    return np.stack([fit, config.overlap_weight * robust_mean(over, 6.0)])
 
 
 def _look_up(low: Float, image: Float, uv: Float) -> Float:
@@ -314,20 +307,8 @@ def _evidence(
         inner=inner,
         inner_sigma=np.full(len(inner), np.hypot(config.assembly.sigma_m, misfit)),
         inner_weight=np.full(len(inner), 0.5 * main.total / len(inner)),
-        seen=_seen(main, uv),
+        seen=seen_beside(main, uv),
     )
-
-
-def _seen(main: Evidence, ends: Float) -> Float:
-    """Where the outline must lie on the seen one: not beside ends that lie amid the main group."""
-    at = np.rint((ends - main.origin) / EVIDENCE_CELL_M).astype(int)
-    rows, cols = main.distance.shape
-    col, row = np.clip(at, 0, [cols - 1, rows - 1]).T
-    within = main.distance[row, col] < -CELL_M
-    free = np.ones((rows, cols), np.uint8)
-    free[row[within], col[within]] = 0
-    away = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * EVIDENCE_CELL_M
-    return np.where(away < FREE_M, 0.0, main.seen)
 
 
 def _shape(group: Group) -> _Shape:

@@ -151,6 +151,18 @@ def together(
     sides: Sequence[Float],
     config: RotationConfig,
 ) -> Unfolded:
+    """Several groups as one.
+
+    Parameters
+    ----------
+    groups : sequence of Unfolded
+    parts : tuple of Part
+        Theirs, in one plane.
+    points : sequence of FlatPoints
+        Of each group, in that plane.
+    sides : sequence of ndarray of shape (n,)
+        Of each group's points, there.
+    """
     surface = groups[0].surface
     count = np.array([len(p.uv) for p in points])
     z = [p.uv @ np.array([1, 1j]) for p in points]

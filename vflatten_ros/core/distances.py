@@ -64,30 +64,31 @@ class _Walk:
     steps: Steps
     rim_detour_m: float
 
-    def lengths(self, landmark: Int, sample: Int) -> tuple[Float, Bool]:
-        """Distances from landmarks to samples, and whether along one sheet and straight."""
-        straight, path, rims = self._straight(landmark, sample)
-        path = path - self.rim_detour_m * rims
-        usable = (rims == 0) & (straight > STRAIGHT_LEAST * path)
-        moved = usable & (path > 0)
-        stretch = float(np.median(path[moved] / straight[moved])) if moved.any() else 1.0
-        return np.where(usable, straight, path / stretch), usable
-
-    def _straight(self, landmark: Int, sample: Int) -> tuple[Float, Float, Int]:
-        """Distance between the laid out ends of paths, their lengths, and rims on the way."""
-        straight, path = np.empty(len(sample)), np.empty(len(sample))
+    def ends(self, landmark: Int, sample: Int) -> _Ends:
+        """Where landmarks lie, seen from samples near them, along the paths between."""
+        back, path = np.empty(len(sample), dtype=complex), np.empty(len(sample))
         rims = np.empty(len(sample), dtype=np.int64)
         order = np.argsort(landmark.astype(np.int16), kind="stable")
         firsts = range(0, len(self.chosen), GROUP)
         ends = np.searchsorted(landmark[order], [*firsts, len(self.chosen)])
         for first, low, high in zip(firsts, ends[:-1], ends[1:], strict=True):
             some = order[low:high]
-            straight[some], path[some], rims[some] = self._straight_from(
+            back[some], path[some], rims[some] = self._laid_out_from(
                 first, landmark[some], sample[some]
             )
-        return straight, path, rims
+        return _Ends(back, path, rims)
 
-    def _straight_from(self, first: int, landmark: Int, sample: Int) -> tuple[Float, Float32, Int]:
+    def lengths(self, ends: _Ends) -> tuple[Float, Bool]:
+        """Lengths of paths, and whether they go along one sheet and straight."""
+        straight, path = np.abs(ends.back), ends.path - self.rim_detour_m * ends.rims
+        usable = (ends.rims == 0) & (straight > STRAIGHT_LEAST * path)
+        moved = usable & (path > 0)
+        stretch = float(np.median(path[moved] / straight[moved])) if moved.any() else 1.0
+        return np.where(usable, straight, path / stretch), usable
+
+    def _laid_out_from(
+        self, first: int, landmark: Int, sample: Int
+    ) -> tuple[NDArray[np.complex128], Float32, Int]:
         """The same from GROUP landmarks, each path laid out from that of the sample before it."""
         count = self.paths.shape[1]
         ends = self.paths.indptr[first : first + GROUP + 1]
@@ -123,7 +124,23 @@ class _Walk:
             rims[at] = rim[now] + rims[back]
             needed[at] = False
             waiting = waiting[~ready]
-        return np.abs(total[wanted]), path[wanted], rims[wanted]
+        return total[wanted], path[wanted], rims[wanted]
+
+
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    """Paths to some samples, laid out in their tangent planes."""
+
+    back: NDArray[np.complex128]  # (m,) from the sample to where its path starts
+    path: Float  # (m,) length along the links
+    rims: Int  # (m,) rims on the way
+
+    def part(self, which: slice) -> _Ends:
+        return _Ends(self.back[which], self.path[which], self.rims[which])
+
+    def across(self, other: _Ends) -> _Ends:
+        """Paths from one start to another, by the sample where both meet."""
+        return _Ends(self.back - other.back, self.path + other.path, self.rims + other.rims)
 
 
 def surface_distances(
@@ -175,23 +192,28 @@ def surface_distances(
     degree = np.bincount(np.r_[a[both], b[both]], minlength=count)
     firm = inside & (degree >= FIRM_LINKS)
     inside[end[inside[start]]] = True
-    chosen, paths, before = _landmarks(graph, firm, config, progress)
-    rank = np.full(count, -1)
-    rank[chosen] = np.arange(len(chosen))
-    source = np.repeat(np.arange(len(chosen)), np.diff(paths.indptr))
-    target = rank[paths.indices]
-    others = (target >= 0) & (target != source)
-    source, target = source[others], target[others]
+    link_m = float(length_m.max())
+    reach_m = (config.local_m + link_m) / 2  # two paths meet half way
+    chosen, paths, before = _landmarks(graph, firm, config.landmarks, reach_m, progress)
+    progress("distances", 0.5)
+    one, other, middle, _ = _meetings(paths, passable, config.local_m, link_m)
+    around = _nearest(paths, min(PLACED_BY, len(chosen) - 1))
+    reached = around >= 0
     progress("distances", 0.6)
     steps = steps or link_steps(xyz, normal, links)
     walk = _Walk(paths, before, chosen, steps, config.rim_detour_m)
-    length, usable = walk.lengths(source, chosen[target])
+    ends = walk.ends(
+        np.r_[one, other, around[reached]], np.r_[middle, middle, np.nonzero(reached)[0]]
+    )
+    met = len(one)
+    length, usable = walk.lengths(ends.part(slice(met)).across(ends.part(slice(met, 2 * met))))
     local = np.full((len(chosen), len(chosen)), np.inf)
-    local[source, target] = length
-    local = np.fmin(local, local.T)
     sheet = np.zeros(local.shape, dtype=bool)
-    sheet[source, target] = usable
-    sheet |= sheet.T
+    local[one, other] = local[other, one] = length
+    sheet[one, other] = sheet[other, one] = usable
+    around_m = np.full(around.shape, np.inf)
+    around_sheet = np.zeros(around.shape, dtype=bool)
+    around_m[reached], around_sheet[reached] = walk.lengths(ends.part(slice(2 * met, None)))
     bound = shortest_path(np.where(np.isfinite(local), local, 0.0), method="D", directed=False)
     if not np.isfinite(bound).all():
         raise DisconnectedSurface(
@@ -202,18 +224,30 @@ def surface_distances(
         chosen,
         (bound + bound.T) / 2,
         sheet & (local < 1.05 * bound + 0.003),
-        *_around(walk, min(PLACED_BY, len(chosen) - 1)),
+        np.maximum(around, 0),
+        around_m,
+        around_sheet,
         inside,
     )
 
 
 def link_distances(links: Links, chosen: Int, count: int, reach_m: float) -> Float:
     """(k, k) lengths of shortest paths over links between landmarks, far ones over near ones."""
-    graph = csr_matrix((links.length_m, (links.a, links.b)), shape=(count, count))
-    near = dijkstra(graph, directed=False, indices=chosen, limit=reach_m)[:, chosen] / ZIGZAG
-    lengths: Float = shortest_path(
-        np.where(np.isfinite(near), near, 0.0), method="D", directed=False
-    )
+    a, b, length_m = links.a, links.b, links.length_m
+    both = (np.r_[a, b], np.r_[b, a])
+    graph = csr_matrix((np.r_[length_m, length_m], both), shape=(count, count))
+    link_m = float(length_m.max())
+    paths = [dijkstra(graph, indices=k, limit=(reach_m + link_m) / 2) for k in chosen]
+    near = [np.flatnonzero(np.isfinite(path)) for path in paths]
+    length = np.concatenate([path[at] for path, at in zip(paths, near, strict=True)])
+    length = length.astype(np.float32)
+    ends = np.cumsum([0, *map(len, near)])
+    reached = csr_matrix((length, np.concatenate(near), ends), shape=(len(chosen), count))
+    everywhere = np.ones(count, dtype=bool)
+    one, other, _, path = _meetings(reached, everywhere, reach_m, link_m)
+    local = np.zeros((len(chosen), len(chosen)))
+    local[one, other] = path / ZIGZAG
+    lengths: Float = shortest_path(local, method="D", directed=False)
     return lengths
 
 
@@ -226,11 +260,10 @@ def pieces(a: Int, b: Int, passable: Bool) -> Int:
     return label
 
 
-def _around(walk: _Walk, count: int) -> tuple[Int, Float, Bool]:
-    """Landmarks nearest to each sample, and how far they are."""
-    by_sample = walk.paths.tocsc()
+def _nearest(paths: csr_matrix, count: int) -> Int:
+    """(n, count) landmarks nearest to each sample; -1 where fewer are near."""
+    by_sample = paths.tocsc()
     nearest = np.empty((by_sample.shape[1], count), dtype=np.int64)
-    reached = np.empty(nearest.shape, dtype=bool)
     for start in range(0, len(nearest), BLOCK):
         ends = by_sample.indptr[start : start + BLOCK + 1]
         known = slice(ends[0], ends[-1])
@@ -238,21 +271,57 @@ def _around(walk: _Walk, count: int) -> tuple[Int, Float, Bool]:
         row = np.repeat(np.arange(len(path)), np.diff(ends))
         path[row, by_sample.indices[known]] = by_sample.data[known]
         first = np.argpartition(path, count, axis=1)[:, :count]
-        nearest[start : start + BLOCK] = first
-        reached[start : start + BLOCK] = np.isfinite(np.take_along_axis(path, first, axis=1))
-    sample = np.broadcast_to(np.arange(len(nearest))[:, None], nearest.shape)
-    length = np.full(nearest.shape, np.inf)
-    sheet = np.zeros(nearest.shape, dtype=bool)
-    length[reached], sheet[reached] = walk.lengths(nearest[reached], sample[reached])
-    return nearest, length, sheet
+        reached = np.isfinite(np.take_along_axis(path, first, axis=1))
+        nearest[start : start + BLOCK] = np.where(reached, first, -1)
+    return nearest
+
+
+def _meetings(
+    paths: csr_matrix, passable: Bool, most_m: float, link_m: float
+) -> tuple[Int, Int, Int, Float32]:
+    """Pairs of landmarks that a path joins, the sample half way where theirs meet, its length.
+
+    Parameters
+    ----------
+    paths : csr_matrix of shape (k, n)
+        Lengths from the landmarks to samples within half of what is asked, and a link more.
+    passable : ndarray of shape (n,)
+    most_m : float
+        Longest path.
+    link_m : float
+        Longest link: of half way, a sample is off by half of it at most.
+    """
+    count, by_sample = paths.shape[0], paths.tocsc()
+    least = np.full(count * count, most_m, dtype=np.float32)
+    middle = np.full(count * count, -1)
+    for start in range(0, len(passable), BLOCK):
+        ends = by_sample.indptr[start : start + BLOCK + 1]
+        known = slice(ends[0], ends[-1])
+        sample = np.repeat(np.arange(start, start + len(ends) - 1), np.diff(ends))
+        length, landmark = by_sample.data[known], by_sample.indices[known]
+        through = passable[sample]
+        sample, length, landmark = sample[through], length[through], landmark[through]
+        key = sample * (2 * most_m) + length
+        order = np.argsort(key, kind="stable")
+        key, sample, length, landmark = (x[order] for x in (key, sample, length, landmark))
+        after = np.searchsorted(key, key + link_m, side="right") - np.arange(len(key)) - 1
+        one = np.repeat(np.arange(len(key)), after)
+        other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(after) - after, after)
+        i, j = landmark[one].astype(np.int64), landmark[other].astype(np.int64)
+        pair = np.minimum(i, j) * count + np.maximum(i, j)
+        path = length[one] + length[other]
+        np.minimum.at(least, pair, path)
+        best = path == least[pair]
+        middle[pair[best]] = sample[one[best]]
+    pair = np.flatnonzero(middle >= 0)
+    return pair // count, pair % count, middle[pair], least[pair]
 
 
 def _landmarks(
-    graph: csr_matrix, firm: Bool, config: RotationConfig, progress: Progress
+    graph: csr_matrix, firm: Bool, most: int, reach_m: float, progress: Progress
 ) -> tuple[Int, csr_matrix, NDArray[np.int32]]:
     """Farthest-point landmarks, their distances to the samples near them, and the paths there."""
-    limit = config.local_m
-    most = min(config.landmarks, int(firm.sum()))
+    most = min(most, int(firm.sum()))
     nearest = np.where(firm, np.inf, -1.0)
     chosen = np.empty(most, dtype=np.int64)
     length: list[Float32] = []
@@ -260,9 +329,9 @@ def _landmarks(
     near: list[NDArray[np.int32]] = []
     for k in range(most):
         if k % GROUP == 0:
-            progress("distances", 0.1 + 0.5 * k / most)
+            progress("distances", 0.1 + 0.4 * k / most)
         chosen[k] = nearest.argmax()
-        row, paths = dijkstra(graph, indices=chosen[k], limit=limit, return_predecessors=True)
+        row, paths = dijkstra(graph, indices=chosen[k], limit=reach_m, return_predecessors=True)
         near.append(np.flatnonzero(np.isfinite(row)).astype(np.int32))
         length.append(row[near[k]].astype(np.float32))
         before.append(paths[near[k]])

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.geometry import tangents
+from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 RING_M = (0.007, 0.014)  # cloth on both sides of a sample: beyond what one fit averages
@@ -58,10 +59,14 @@ def ramps(
     steep = np.flatnonzero(tilt * STEP_HEIGHT_M > config.ramp)
     tree = cKDTree(points[::2], balanced_tree=False, compact_nodes=False)
     step = np.zeros(len(xyz))
-    for start in range(0, len(steep), CHUNK):
-        progress("ramps", 0.4 + 0.6 * start / len(steep))
-        some = steep[start : start + CHUNK]
-        step[some] = _step(xyz[some], normal[some], points[::2], normals[::2], tree)
+    chunks = [steep[start : start + CHUNK] for start in range(0, len(steep), CHUNK)]
+
+    def fitted(some: Int) -> Float:
+        return _step(xyz[some], normal[some], points[::2], normals[::2], tree)
+
+    for done, (some, heights) in enumerate(zip(chunks, mapped(fitted, chunks), strict=True)):
+        progress("ramps", 0.4 + 0.6 * done / len(chunks))
+        step[some] = heights
     found: Float = step * tilt / config.ramp
     return found
 

@@ -31,7 +31,7 @@ from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.unfolding import SPREAD, orientation, settle, unfold
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
-PUZZLE, CLOSED, SPREAD_OUT = "puzzle", "closed", "spread"
+PUZZLE, CLOSED = "puzzle", "closed"
 SMALLEST = 0.01  # share of the samples that makes a piece
 SMALL_GROUP, SMALL_LANDMARKS = 0.15, 150
 RIM_SLACK_M = 0.004  # between the two sides of a rim
@@ -71,9 +71,11 @@ def group_pieces(
             progress("pieces", (done + fraction) / len(found))
 
         flat.append(laid_flat(surface, sheet, piece, config, flattening))
-    sides = [
-        orientation(np.nan_to_num(uv), samples.xyz, samples.normal, sheet.a, sheet.b) for uv in flat
-    ]
+    sides = []
+    for uv, piece in zip(flat, found, strict=True):
+        own = piece[sheet.a] & piece[sheet.b]
+        a, b = sheet.a[own], sheet.b[own]
+        sides.append(orientation(np.nan_to_num(uv), samples.xyz, samples.normal, a, b))
     number = np.full(len(samples.xyz), -1)
     for k, piece in enumerate(found):
         number[piece] = k
@@ -129,9 +131,10 @@ def unfold_group(
     grouped : Grouped
     which : int
         The group.
-    closed : bool
-        Believe rims of one piece, too, and begin with what all links give, wrong ones as well: it
-        keeps tubes closed that the group's own distances leave open. Otherwise begin spread out.
+    start : str
+        PUZZLE: begin as the pieces were put together. CLOSED: believe rims of one piece, too, and
+        begin with what all links give, wrong ones as well: it keeps tubes closed that the group's
+        own distances leave open.
 
     Raises
     ------
@@ -150,12 +153,9 @@ def unfold_group(
         everything = link_distances(surface.links, distances.chosen, len(mask), config.local_m)
         rough = replace(config, unfold_rounds=max(1, config.unfold_rounds // 2))
         plane = unfold(np.minimum(everything, bound), near, rough, progress)
-        plane = settle(plane, bound, near, config, SPREAD[-1])
-    elif start == PUZZLE:
-        plane = grouped.places[distances.chosen]
-        plane = settle(plane, bound, near, config, SPREAD[-1])
     else:
-        plane = unfold(bound, near, config, progress)
+        plane = grouped.places[distances.chosen]
+    plane = settle(plane, bound, near, config, SPREAD[-1])
     progress("outline", 0.0)
     return unfolded_from(surface, Part(distances, plane), config)
 

@@ -6,9 +6,9 @@ item then lies flat, and is one of a kind that exists, can.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 
 import numpy as np
 
@@ -17,13 +17,11 @@ from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.grouping import (
     CLOSED,
     PUZZLE,
-    SPREAD_OUT,
     Grouped,
     group_pieces,
     put_beside,
     unfold_group,
 )
-from vflatten_ros.core.parallel import Ahead, Once
 from vflatten_ros.core.placing import Group, place_groups
 from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
 from vflatten_ros.core.rotation import (
@@ -41,19 +39,14 @@ WHOLE = "whole"
 WAYS = (  # how, greatest doubt, badness of what was tried before below which it is left out
     (WHOLE, np.inf, -np.inf),
     (PUZZLE, 1.0, -0.5),
-    (CLOSED, 1.0, -0.2),
-    (SPREAD_OUT, 1.0, -0.2),
-    (WHOLE, 1.0, 0.0),
-    (PUZZLE, 0.6, 0.0),
-    (CLOSED, 0.6, 0.0),
-    (WHOLE, 0.6, 0.0),
-    (PUZZLE, 0.4, 0.0),
-    (CLOSED, 0.4, 0.0),
-    (SPREAD_OUT, 0.4, 0.0),
+    (WHOLE, 1.0, 0.1),
+    (CLOSED, 1.0, 0.1),
+    (PUZZLE, 0.4, 0.1),
 )
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
+ASIDE = 2.0  # of the share that is left out in large groups, beside: it can be no noise
 WORTH_PLACING = 0.1  # share of the samples of a group
 PLACED_WAYS = 2  # categories by which groups are placed that are looked at
 
@@ -64,6 +57,7 @@ class Tried:
 
     unfolded: Unfolded
     found: Recognition
+    aside: float = 0.0  # share of the samples in large groups that were left out
 
     @property
     def badness(self) -> float:
@@ -77,6 +71,7 @@ class Tried:
         left_out = max(0.0, 1.0 - self.unfolded.share - STRAYS) / MOSTLY_LEFT
         explained = self.found.fit.explained if self.found.fit is not None else 0.0
         odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD
+        left_out += ASIDE * self.aside
         return float(misfit + folded + left_out + odd + (self.found.category == UNKNOWN))
 
 
@@ -88,72 +83,76 @@ def likeliest(
 ) -> Tried:
     """The way of laying the surface flat that makes the best item.
 
-    Most items need two tries, so two are made at once, and a result that is not needed is dropped.
-
     Raises
     ------
     VFlattenError
         No way led to a flat surface.
     """
-    linked = Once(partial(link_surface, fused, config.rotation))
-    looked = Once(partial(doubts, fused, config.rotation))
-
-    def surface(doubt: float, progress: Progress) -> Surface:
-        ramps = looked(progress) if np.isfinite(doubt) else None
-        plain = linked(progress)
-        return plain if ramps is None else replace(plain, doubt=ramps)
-
-    def pieces(doubt: float, progress: Progress) -> Grouped:
-        return group_pieces(surface(doubt, progress), doubt, config.rotation, progress)
-
-    grouped = {doubt: Once(partial(pieces, doubt)) for _, doubt, _ in WAYS}
-
-    def tried(how: str, doubt: float, progress: Progress) -> Tried:
-        if how == WHOLE:
-            whole = surface(doubt, progress)
-            unfolded = unfold_surface(whole, doubt, config.rotation, progress)
-            return _recognised(unfolded, templates, config, progress)
-        groups = grouped[doubt](progress)
-        return _from_groups(groups, how, templates, config, progress)
-
-    ways = [(enough, partial(tried, how, doubt)) for how, doubt, enough in WAYS]
-    return _first_good(ways, progress)
-
-
-def _first_good(
-    ways: Sequence[tuple[float, Callable[[Progress], Tried]]], progress: Progress
-) -> Tried:
-    """The best of the ways; those that are needed only if none before was as good as they ask."""
     tries: list[Tried] = []
     failures: list[DisconnectedSurface] = []
-    number, needed = 0, len(ways)
-    with Ahead([way for _, way in ways]) as ahead:
-        while number < needed:
-            try:
-                tries.append(ahead.result(number, progress))
-            except DisconnectedSurface as error:
-                failures.append(error)
-            number += 1
-            best = min((tried.badness for tried in tries), default=np.inf)
-            later = range(number, len(ways))
-            needed = next((k for k in later if best < ways[k][0]), len(ways))
-            ahead.drop(needed)
+    ways = _Ways(fused, templates, config, progress)
+    for how, doubt, enough in WAYS:
+        if min((tried.badness for tried in tries), default=np.inf) < enough:
+            break
+        try:
+            tries.append(ways.tried(how, doubt))
+        except DisconnectedSurface as error:
+            failures.append(error)
     if not tries:
         raise failures[0]
     return min(tries, key=lambda tried: tried.badness)
 
 
+class _Ways:
+    """The ways, with what several of them need."""
+
+    def __init__(
+        self,
+        fused: Fused,
+        templates: tuple[Template, ...],
+        config: Config,
+        progress: Progress,
+    ) -> None:
+        self._fused, self._templates = fused, templates
+        self._config, self._progress = config, progress
+        self._grouped: dict[float, Grouped] = {}
+
+    @cached_property
+    def _linked(self) -> Surface:
+        return link_surface(self._fused, self._config.rotation, self._progress)
+
+    @cached_property
+    def _doubted(self) -> Surface:
+        linked = self._linked
+        doubt = doubts(self._fused, self._config.rotation, self._progress)
+        return replace(linked, doubt=doubt)
+
+    def tried(self, how: str, doubt: float) -> Tried:
+        """One of WAYS.
+
+        Raises
+        ------
+        DisconnectedSurface
+        """
+        config, progress = self._config, self._progress
+        if how == WHOLE:
+            surface = self._doubted if np.isfinite(doubt) else self._linked
+            unfolded = unfold_surface(surface, doubt, config.rotation, progress)
+            return _recognised(unfolded, self._templates, config, progress)
+        if doubt not in self._grouped:
+            self._grouped[doubt] = group_pieces(self._doubted, doubt, config.rotation, progress)
+        grouped = self._grouped[doubt]
+        worth = [k for k, mask in enumerate(grouped.masks) if k == 0 or mask.mean() > WORTH_PLACING]
+        laid = [unfold_group(grouped, k, how, config.rotation, progress) for k in worth]
+        return _from_groups(laid, self._templates, config, progress)
+
+
 def _from_groups(
-    grouped: Grouped,
-    start: str,
-    templates: tuple[Template, ...],
-    config: Config,
-    progress: Progress,
+    laid: Sequence[Unfolded], templates: tuple[Template, ...], config: Config, progress: Progress
 ) -> Tried:
     """The largest group by itself, or with the others placed beside it, whichever is better."""
-    which = [k for k, mask in enumerate(grouped.masks) if k == 0 or mask.mean() > WORTH_PLACING]
-    laid = [unfold_group(grouped, k, start, config.rotation, progress) for k in which]
-    tries = [_recognised(laid[0], templates, config, progress)]
+    alone = _recognised(laid[0], templates, config, progress)
+    tries = [replace(alone, aside=sum(group.share for group in laid[1:]))]
     if len(laid) > 1:
         groups = [Group(one.points, one.side, one.outline) for one in laid]
         placings = place_groups(groups, templates, config, progress)

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RecognitionConfig
 from vflatten_ros.core.errors import InvalidInput
+from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.templates import Float
 from vflatten_ros.core.values import Bool, FlatPoints, Int, Outline
 
@@ -71,7 +72,7 @@ def evidence_from(outline: Outline, points: FlatPoints, config: RecognitionConfi
     """
     if len(outline.uv) < 3 or not np.isfinite(outline.uv).all():
         raise InvalidInput(f"outline: expected three finite points or more, got {outline.uv.shape}")
-    if abs(_twice_area(outline.uv)) < 2e-4:
+    if abs(twice_area(outline.uv)) < 2e-4:
         raise InvalidInput("outline: encloses less than 1 cm2")
     origin = outline.uv.min(axis=0) - MARGIN_M
     cols, rows = np.ceil((outline.uv.max(axis=0) + MARGIN_M - origin) / CELL_M).astype(int) + 1
@@ -105,11 +106,6 @@ def evidence_from(outline: Outline, points: FlatPoints, config: RecognitionConfi
         seen=seen,
         density=density,
     )
-
-
-def _twice_area(uv: Float) -> float:
-    after = np.roll(uv, -1, axis=0)
-    return float((uv[:, 0] * after[:, 1] - uv[:, 1] * after[:, 0]).sum())
 
 
 def _cells(uv: Float, origin: Float) -> NDArray[np.int32]:
@@ -150,7 +146,7 @@ def _with_gaps(
     outline: Outline, origin: Float, body: NDArray[np.uint8], gaps: NDArray[np.uint8]
 ) -> Outline:
     """The outline, counter-clockwise, going in and out of gaps that reach it."""
-    flip = slice(None, None, 1 if _twice_area(outline.uv) > 0 else -1)
+    flip = slice(None, None, 1 if twice_area(outline.uv) > 0 else -1)
     given = Outline(outline.uv[flip], outline.sigma_m[flip], outline.inferred[flip])
     if not gaps.any():
         return given
@@ -160,7 +156,7 @@ def _with_gaps(
     if cv2.contourArea(largest.astype(np.float32)) < 0.6 * body.sum():
         return given
     uv = origin + CELL_M * largest
-    uv = uv if _twice_area(uv) > 0 else uv[::-1]
+    uv = uv if twice_area(uv) > 0 else uv[::-1]
     given = _evenly(given, 8 * SAMPLES)
     far, near = cKDTree(given.uv).query(uv)
     uv = np.where((far < 0.01)[:, None], given.uv[near], uv)

@@ -70,3 +70,15 @@ def tangents(normal: Float) -> tuple[Float, Float]:
     e1 = np.cross(normal, np.eye(3)[least])
     e1 /= np.maximum(np.linalg.norm(e1, axis=1, keepdims=True), 1e-12)
     return e1, np.cross(normal, e1)
+
+
+def twice_area(uv: Float) -> float:
+    """Of a closed line (n, 2), positive counter-clockwise."""
+    after = np.roll(uv, -1, axis=0)
+    return float((uv[:, 0] * after[:, 1] - uv[:, 1] * after[:, 0]).sum())
+
+
+def thinned_loop(uv: Float, reach: int = 2) -> Float:
+    """Every second point of a closed line (n, 2), each the mean of those up to `reach` away."""
+    smooth: Float = np.mean([np.roll(uv, k, axis=0) for k in range(-reach, reach + 1)], axis=0)
+    return smooth[::2]

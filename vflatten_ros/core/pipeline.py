@@ -11,6 +11,7 @@ from vflatten_ros.core.assembly import assemble
 from vflatten_ros.core.automatic_pair import fill_up, flatten_best_pair
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
+from vflatten_ros.core.filling import filled
 from vflatten_ros.core.hypotheses import likeliest
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.model_images import model_image_scores
@@ -184,6 +185,8 @@ def _described(
     measurements = tuple(
         replace(m, sigma_m=float(np.hypot(m.sigma_m, shared))) for m in measured.measurements
     )
+    if automatic and recognition.fit is not None and recognition.category != UNKNOWN:
+        outline = filled(outline, recognition.fit)
     told = {notice.code for notice in flattened.notices}
     garment = FlatGarment(
         method=config.method,

@@ -105,6 +105,8 @@ def camera_rays(points: Float, pixel: NDArray[np.int32], shape: tuple[int, int])
     """
     step = max(1, len(points) // 4000)
     sample, rc = points[::step], pixel[::step].astype(float)
+    if np.ptp(rc, axis=0).min() < 1.0:
+        return None  # one row or column: many cameras fit
     scale = max(float(np.ptp(rc)), 1.0)
     ones = np.concatenate([sample, np.ones((len(sample), 1))], axis=1)
     fit, *_ = np.linalg.lstsq(ones, rc, rcond=None)

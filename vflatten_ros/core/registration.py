@@ -20,6 +20,7 @@ from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.geometry import Float, inverse, rigid, rotation_about, transform_points
 from vflatten_ros.core.parallel import mapped
+from vflatten_ros.core.sight import Sight, sight_of
 from vflatten_ros.core.values import Int, Progress, View, no_progress
 
 MIN_POINTS = 100  # a view with fewer item points shows nothing that could be placed
@@ -39,6 +40,7 @@ class ViewSurface:
     index: Int  # (n,) row of the view's points
     camera: Float  # (3,) hanger frame
     tree: cKDTree  # of smooth
+    sight: Sight | None = None  # in the hanger frame; None if the cloud is not that of a camera
 
 
 def view_surface(view: View, config: RotationConfig) -> ViewSurface:
@@ -71,6 +73,7 @@ def view_surface(view: View, config: RotationConfig) -> ViewSurface:
         np.flatnonzero(good),
         camera,
         cKDTree(smooth[good]),
+        sight_of(points, view.pixel, view.shape),
     )
 
 

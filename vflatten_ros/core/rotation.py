@@ -18,13 +18,19 @@ from vflatten_ros.core.correspondences import NOTHING_GIVEN, Judged, judged, pla
 from vflatten_ros.core.distances import Distances, Steps, link_steps, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.fusion import Samples, fuse
-from vflatten_ros.core.geometry import transform_directions, transform_points
+from vflatten_ros.core.geometry import (
+    thinned_loop,
+    transform_directions,
+    transform_points,
+    twice_area,
+)
 from vflatten_ros.core.joining import agreeing, find_ties, largest_pieces, near_paths
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.puzzle import overlap as lying_on
 from vflatten_ros.core.ramps import ramps
 from vflatten_ros.core.registration import ViewSurface, register_views, view_surface
-from vflatten_ros.core.sheets import Links, link_samples, sheet_edges
+from vflatten_ros.core.sheets import Links, link_samples, outward, sheet_edges
+from vflatten_ros.core.sight import PlacedSight, goes_on
 from vflatten_ros.core.slide import neighbours, slide_m
 from vflatten_ros.core.slide import notice_of as slide_notice
 from vflatten_ros.core.unfolding import (
@@ -60,6 +66,8 @@ MOST_JOINS = 3
 MOST_DOUBTFUL = 0.1  # of the samples, at a doubt of 1
 TOLD_M = 1e-4  # length of a link between samples that are said to be one point of the cloth
 TOLD_AMONG = 8  # samples nearest to such a point, of which the nearest that faces its way is it
+SLIT_M = 0.03  # widest slit of which one side tells what the other is
+RIM_LAID_M = 0.015  # between the two sides of a rim that lies flat as one
 CELL_M = 0.002  # of the image whose contour is the outline
 
 
@@ -72,6 +80,7 @@ class Fused:
     normals: Float  # (m, 3)
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
+    sights: tuple[PlacedSight, ...] = ()  # none: whether cloth goes on is told by the samples
     given: Judged = NOTHING_GIVEN  # corresponding points
     notices: tuple[Notice, ...] = ()
 
@@ -83,7 +92,7 @@ class Surface:
     samples: Samples
     links: Links
     steps: Steps  # of the links
-    edge: Int  # (n,) of sheet_edges
+    edge: Int  # (n,) of sheet_edges, as far as views tell no better
     doubt: Float  # (n,) above 1: may be a ramp between two layers; 0 where nobody looked
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
@@ -181,7 +190,7 @@ def together(
     )
     row = np.concatenate([g.row for g in groups])
     firm = np.concatenate([g.firm for g in groups])
-    edge = surface.edge[row][firm]
+    edge = edges_laid(surface, row, all_points.uv)[firm]
     outline = outline_of(all_points.uv[firm], all_points.sigma_m[firm], edge, config)
     notices = {notice.code: notice for g in groups for notice in g.notices}
     stress = float(np.sqrt((all_points.stress**2).mean()))
@@ -351,7 +360,12 @@ def fuse_views(
     doubted = prints is not None and slid is not None and slid > prints.slide_m
     notices = (slide_notice(slid),) if slid is not None and doubted else ()
     checked = judged(given, placed, limits or IntegrationConfig())
-    return Fused(samples, points, normals, ids[of_view], pixel, checked, notices)
+    sights = tuple(
+        PlacedSight(surface.sight, pose)
+        for surface, pose in zip(surfaces, poses, strict=True)
+        if surface.sight is not None
+    )
+    return Fused(samples, points, normals, ids[of_view], pixel, sights, checked, notices)
 
 
 def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Surface:
@@ -361,7 +375,7 @@ def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_p
     links = link_samples(samples.xyz, samples.normal, config)
     progress("link", 0.7)
     links = links.with_links(*_told(fused, config), TOLD_M)
-    edge = _edges(samples, links, config)
+    edge = _edges(samples, links, fused.sights, config)
     doubt = np.zeros(len(samples.xyz))
     steps = link_steps(samples.xyz, samples.normal, links)
     return Surface(samples, links, steps, edge, doubt, fused.view_id, fused.pixel)
@@ -392,12 +406,41 @@ def doubts(fused: Fused, config: RotationConfig, progress: Progress = no_progres
     return ramps(samples.xyz, samples.normal, fused.points, fused.normals, config, progress)
 
 
-def _edges(samples: Samples, links: Links, config: RotationConfig) -> Int:
+def _edges(
+    samples: Samples, links: Links, sights: Sequence[PlacedSight], config: RotationConfig
+) -> Int:
     sheet = ~links.rim
-    edge = sheet_edges(samples.xyz, samples.normal, links.a[sheet], links.b[sheet], config)
-    # what both sides of were seen ends there, whatever lies on it
+    a, b = links.a[sheet], links.b[sheet]
+    edge = sheet_edges(samples.xyz, samples.normal, a, b, config)
+    ends = np.flatnonzero(edge)
+    xyz, normal = samples.xyz[ends], samples.normal[ends]
+    on = goes_on(xyz, normal, outward(samples.xyz, samples.normal, a, b)[ends], sights)
+    edge[ends] = np.where(on < 0, edge[ends], 1 + on)
+    return edge
+
+
+def edges_laid(surface: Surface, row: Int, uv: Float) -> Int:
+    """Edges (n,) of samples as they lie flat: 0 none, 1 of the cloth, 2 of what was seen of it.
+
+    Where both sides of a rim lie side by side, the cloth ends, whatever hangs before it.
+
+    Parameters
+    ----------
+    surface : Surface
+    row : ndarray of shape (n,)
+        The samples.
+    uv : ndarray of shape (n, 2)
+        Their places.
+    """
+    links, edge = surface.links, surface.edge[row]
+    at = np.full(len(surface.edge), -1)
+    at[row] = np.arange(len(row))
     rim = links.rim & (links.doubt < 1.0)
-    edge[np.r_[links.a[rim], links.b[rim]]] = 1
+    a, b = at[links.a[rim]], at[links.b[rim]]
+    both = (a >= 0) & (b >= 0)
+    a, b = a[both], b[both]
+    near = np.linalg.norm(uv[a] - uv[b], axis=1) < RIM_LAID_M
+    edge[np.r_[a[near], b[near]]] = 1
     return edge
 
 
@@ -429,7 +472,8 @@ def unfolded_from(surface: Surface, part: Part, config: RotationConfig) -> Unfol
     # what is placed round rims alone has upper bounds only, and so lies too far out
     firm = (distances.around_sheet.sum(1) >= FIRM)[placed]
     firm |= firm.mean() < FIRM_SHARE  # too few would leave holes
-    outline = outline_of(points.uv[firm], points.sigma_m[firm], surface.edge[placed][firm], config)
+    edge = edges_laid(surface, np.flatnonzero(placed), points.uv)[firm]
+    outline = outline_of(points.uv[firm], points.sigma_m[firm], edge, config)
     return Unfolded(
         surface,
         (part,),
@@ -471,12 +515,32 @@ def outline_of(uv: Float, sigma_m: Float, edge: Int, config: RotationConfig) -> 
     if not contours:
         raise DisconnectedSurface("the flattened samples enclose no area; take more views")
     longest = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
-    contour = low + CELL_M * _smoothed(longest)
-    if _twice_area(contour) < 0:
+    contour = low + CELL_M * thinned_loop(longest)
+    if twice_area(contour) < 0:
         contour = contour[::-1]
     near = cKDTree(uv).query(contour)[1]
     inferred = _near(contour, uv[edge == 2]) > HIDDEN_SHARE * _near(contour, uv[edge > 0])
+    inferred &= ~_before_an_end(contour, inferred)
     return Outline(contour, sigma_m[near], inferred)
+
+
+def _before_an_end(contour: Float, inferred: Bool) -> Bool:
+    """Where the outline is one side of a slit, on the other side of which the cloth ends.
+
+    Between two legs, one leg hangs before the edge of the other; no cloth goes on there.
+    """
+    normal = np.roll(contour, -2, axis=0) - np.roll(contour, 2, axis=0)
+    normal = np.column_stack([normal[:, 1], -normal[:, 0]])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    i, j = cKDTree(contour).query_pairs(SLIT_M, output_type="ndarray").T
+    across = contour[j] - contour[i]
+    size = np.linalg.norm(across, axis=1)
+    facing = ((across * normal[i]).sum(1) > 0.7 * size) & (
+        (across * normal[j]).sum(1) < -0.7 * size
+    )
+    i, j = np.r_[i[facing], j[facing]], np.r_[j[facing], i[facing]]
+    ends = np.bincount(i, ~inferred[j], len(contour))
+    return ends > 0.5 * np.bincount(i, minlength=len(contour))
 
 
 def _without_spurs(inside: NDArray[np.uint8], radius: int) -> NDArray[np.uint8]:
@@ -505,14 +569,3 @@ def _disc(radius: int) -> NDArray[np.uint8]:
         cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)
     )
     return disc
-
-
-def _smoothed(contour: Float, reach: int = 2) -> Float:
-    shifted = [np.roll(contour, k, axis=0) for k in range(-reach, reach + 1)]
-    smooth: Float = np.mean(shifted, axis=0)[::2]
-    return smooth
-
-
-def _twice_area(contour: Float) -> float:
-    after = np.roll(contour, -1, axis=0)
-    return float((contour[:, 0] * after[:, 1] - contour[:, 1] * after[:, 0]).sum())

@@ -133,6 +133,17 @@ def sheet_edges(xyz: Float, normal: Float, a: Int, b: Int, config: RotationConfi
     return edge
 
 
+def outward(xyz: Float, normal: Float, a: Int, b: Int) -> Float:
+    """(n, 3) unit directions along the sheet away from the samples that each is linked to."""
+    step, n = xyz[b] - xyz[a], len(xyz)
+    away = np.column_stack(
+        [np.bincount(b, along, n) - np.bincount(a, along, n) for along in step.T]
+    )
+    away -= (away * normal).sum(1, keepdims=True) * normal
+    unit: Float = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    return unit
+
+
 def _arc(chord: Float, alike: Float) -> Float:
     """Length of the circular arc over each chord, from the cosine between its normals."""
     half = np.arccos(alike.clip(0.3, 1.0)) / 2

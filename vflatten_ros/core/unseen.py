@@ -16,6 +16,7 @@ from vflatten_ros.core.config import ViewsConfig
 from vflatten_ros.core.geometry import inverse
 from vflatten_ros.core.recognition import UNKNOWN
 from vflatten_ros.core.rotation import Surface
+from vflatten_ros.core.sheets import outward
 from vflatten_ros.core.turntable import TURN
 from vflatten_ros.core.values import (
     Bool,
@@ -100,12 +101,7 @@ def _directions(surface: Surface, views: Sequence[View]) -> Float:
     sheet = ~links.rim
     a, b = links.a[sheet], links.b[sheet]
     n = len(samples.xyz)
-    outward = np.zeros((n, 3))
-    step = samples.xyz[b] - samples.xyz[a]
-    for axis in range(3):
-        outward[:, axis] = np.bincount(b, step[:, axis], n) - np.bincount(a, step[:, axis], n)
-    outward -= (outward * samples.normal).sum(1, keepdims=True) * samples.normal
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    beyond = outward(samples.xyz, samples.normal, a, b)
     facing = np.zeros(n)
     for k, view in enumerate(views):
         toward = inverse(view.calibration.T_rig_hanger(view.angle_rad))[:3, 3] - samples.xyz
@@ -116,8 +112,8 @@ def _directions(surface: Surface, views: Sequence[View]) -> Float:
     away = (surface.edge == 1) & (facing < GRAZING)
     look = np.vstack(
         [
-            samples.normal[hidden] - outward[hidden],
-            samples.normal[away] + outward[away],
+            samples.normal[hidden] - beyond[hidden],
+            samples.normal[away] + beyond[away],
         ]
     )
     unit: Float = look / np.maximum(np.linalg.norm(look, axis=1, keepdims=True), 1e-9)

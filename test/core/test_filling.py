@@ -1,0 +1,85 @@
+"""A rectangle of which a corner is missing: filled where no view shows it, not where it ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vflatten_ros.categories import load_templates
+from vflatten_ros.core.config import RecognitionConfig
+from vflatten_ros.core.filling import filled
+from vflatten_ros.core.geometry import twice_area
+from vflatten_ros.core.recognition import recognise
+from vflatten_ros.core.values import FlatPoints, Outline
+
+WIDTH_M, LENGTH_M, NOTCH_M, STEP_M = 0.34, 0.60, 0.10, 0.004
+TOWEL = tuple(t for t in load_templates() if t.category == "towel")
+CORNERS = np.array(
+    [
+        [0.0, 0.0],
+        [WIDTH_M, 0.0],
+        [WIDTH_M, LENGTH_M - NOTCH_M],
+        [WIDTH_M - NOTCH_M, LENGTH_M - NOTCH_M],
+        [WIDTH_M - NOTCH_M, LENGTH_M],
+        [0.0, LENGTH_M],
+    ]
+)
+NOTCH = (2, 3)  # the sides where it ends
+
+
+def notched(inferred_sides=NOTCH, step=1):
+    """Outline and points of the rectangle; `step` -1 goes round it the other way."""
+    parts, inferred = [], []
+    for k, (start, end) in enumerate(zip(CORNERS, np.roll(CORNERS, -1, axis=0), strict=True)):
+        count = round(float(np.abs(end - start).sum()) / STEP_M)
+        parts.append(start + np.linspace(0, 1, count, endpoint=False)[:, None] * (end - start))
+        inferred.append(np.full(count, k in inferred_sides))
+    uv, flags = np.vstack(parts)[::step], np.concatenate(inferred)[::step]
+    u, v = (
+        x.ravel() for x in np.meshgrid(np.arange(0.005, 0.34, 0.01), np.arange(0.005, 0.6, 0.01))
+    )
+    inside = (u < WIDTH_M - NOTCH_M) | (v < LENGTH_M - NOTCH_M)
+    points = np.column_stack([u, v])[inside]
+    n = len(points)
+    cloth = FlatPoints(
+        uv=points,
+        xyz_hanger=np.column_stack([points, np.zeros(n)]),
+        view_id=np.zeros(n, dtype=np.int64),
+        pixel=np.zeros((n, 2), dtype=np.int64),
+        sigma_m=np.full(n, 0.002),
+        stress=np.zeros(n),
+        inferred=np.zeros(n, dtype=bool),
+    )
+    return Outline(uv, np.full(len(uv), 0.002), flags), cloth
+
+
+def area(outline):
+    return twice_area(outline.uv) / 2
+
+
+def fit_of(outline, points):
+    fit = recognise(outline, points, TOWEL, RecognitionConfig()).fit
+    assert fit is not None
+    return fit
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_a_corner_that_no_view_shows_is_the_category_s(step):
+    outline, points = notched(step=step)
+    found = filled(outline, fit_of(outline, points))
+    assert step * area(found) == pytest.approx(WIDTH_M * LENGTH_M, rel=0.01)
+    away = np.abs(found.uv - CORNERS[3] - NOTCH_M).max(axis=1)
+    added = away < 0.8 * NOTCH_M
+    assert found.inferred[added].all()
+    assert not found.inferred[away > 1.3 * NOTCH_M].any()
+    assert (found.sigma_m[added] > 0.002).all()
+    assert (found.sigma_m[away > 1.3 * NOTCH_M] == 0.002).all()
+
+
+def test_where_the_cloth_was_seen_to_end_nothing_is_added():
+    outline, points = notched(inferred_sides=())
+    assert filled(outline, fit_of(outline, points)) is outline
+    elsewhere, points = notched(inferred_sides=(5,))
+    assert (
+        area(filled(elsewhere, fit_of(elsewhere, points))) < WIDTH_M * LENGTH_M - 0.8 * NOTCH_M**2
+    )

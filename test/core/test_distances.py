@@ -78,6 +78,21 @@ def test_distances_past_samples_in_doubt_are_those_of_the_sheet():
     assert np.isfinite(found.around_m[found.inside]).any(1).all()
 
 
+def test_paths_that_may_end_in_doubt_do_not_meet_there():
+    """A sheet rolled to a tube that does not quite close, with samples in doubt in the gap."""
+    radius_m, gap_m = 0.05, 0.012
+    length_m = 2 * np.pi * radius_m
+    xyz, normal, flat = rolled(radius_m, width_m=length_m, height_m=0.08)
+    gap = (flat[:, 0] < gap_m / 2) | (flat[:, 0] > length_m - gap_m / 2)
+    found = measured(xyz, normal, passable=~gap)
+    u = flat[found.chosen, 0]
+    assert not gap[found.chosen].any()
+    one, other = u < 0.03, u > length_m - 0.03
+    assert one.any() and other.any()
+    assert found.inside[gap].mean() > 0.9  # paths end there
+    assert found.bound_m[np.ix_(one, other)].min() > 0.95 * (length_m - 0.06)
+
+
 def test_lengths_over_links_are_nearly_straight_far_apart_too():
     xyz, normal, flat = rolled(0.1, width_m=0.4)
     links = link_samples(xyz, normal, CONFIG)

@@ -1,0 +1,43 @@
+"""Which of several ways to lay an item flat is the better one."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from vflatten_ros.core.hypotheses import Tried
+
+
+def tried(share=1.0, overlap=0.0, category="towel", misfit=-0.5, explained=1.0, aside=0.0):
+    unfolded = SimpleNamespace(share=share, overlap=overlap)
+    found = SimpleNamespace(
+        category=category, fit=SimpleNamespace(misfit=misfit, explained=explained)
+    )
+    return Tried(unfolded, found, aside)
+
+
+def test_all_that_is_wrong_with_a_way_counts():
+    good = tried().badness
+    assert good == pytest.approx(-0.5)
+    worse = [
+        tried(share=0.7),
+        tried(overlap=0.15),
+        tried(category="unknown"),
+        tried(misfit=0.2),
+        tried(explained=0.7),
+    ]
+    assert all(way.badness > good + 0.4 for way in worse)
+    assert tried(share=0.95, overlap=0.04, explained=0.96).badness == good  # as any result has
+
+
+def test_a_large_piece_left_aside_is_worse_than_as_many_shreds():
+    shreds, piece = tried(share=0.75), tried(share=0.75, aside=0.2)
+    assert piece.badness > shreds.badness + 0.3
+
+
+def test_a_way_that_fits_nothing_is_the_worst():
+    nothing = Tried(
+        SimpleNamespace(share=1.0, overlap=0.0), SimpleNamespace(category="unknown", fit=None)
+    )
+    assert nothing.badness == float("inf")

@@ -588,7 +588,10 @@ class RotationConfig(Checked):
         0.01, "Contradiction of distances above which the result says so, m.", low=1e-4, high=1.0
     )
     hidden_m: float = option(
-        0.01, "Layers nearer than this hide one another's edges, m.", low=0.001, high=0.1
+        0.01,
+        "Layers nearer than this hide one another's edges, where no camera tells, m.",
+        low=0.001,
+        high=0.1,
     )
     untrusted_overlap: float = option(
         0.1,

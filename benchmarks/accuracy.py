@@ -328,13 +328,15 @@ def figures_of_merit(rows: Sequence[Row]) -> list[str]:
         sigmas = [s for row in part for s in row.in_sigmas.values() if s is not None]
         if not sizes:
             continue
+        named = [row for row in part if "ends_alike" not in row.notes]
         lines += [
             f"- {name}, {len(part)} recordings: category right {sum(r.right for r in part)}; "
             f"W and L given {len(sizes)} of {2 * len(part)}, error mean {np.mean(sizes):.1f} %, "
             f"worst {max(sizes):.1f} %; within one σ {_share(sigmas, 1)}, within two "
             f"{_share(sigmas, 2)}; means: points {_centimetres(_mean(part, 'point_median_m'))}, "
             f"overlap {_mean(part, 'overlap') or 0:.3f}, "
-            f"landmarks {_centimetres(_mean(part, 'landmark_median_m'))}"
+            f"landmarks {_centimetres(_mean(part, 'landmark_median_m'))} "
+            f"({_centimetres(_mean(named, 'landmark_median_m'))} where the ends differ)"
         ]
     return lines
 

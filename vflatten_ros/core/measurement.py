@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,6 +16,7 @@ from vflatten_ros.core.templates import Float
 from vflatten_ros.core.values import FlatPoints, Int, Landmark, Measurement, Notice, Outline
 
 CELL_M = 0.01  # of the area counted as seen
+ALIKE_M = 0.01  # between an outline and itself after half a turn, that cannot be told apart
 FEW = 2  # views from which outlines err along whole edges
 
 
@@ -61,7 +63,7 @@ def measure(
         landmarks=landmarks(fit, points, recognition.probabilities[recognition.category], config),
         coverage=coverage,
         quality=quality,
-        notices=_notices(recognition, measurements, coverage, quality, config),
+        notices=_notices(recognition, fit, measurements, coverage, quality, config),
     )
 
 
@@ -149,8 +151,11 @@ def landmarks(
     sigma = np.sqrt(variance.mean(axis=1))
     seen = np.nonzero(~points.inferred)[0]
     tree = cKDTree(points.uv[seen]) if len(seen) else None
+    turned = turned_alike(fit)
     result = []
     for name, i in fit.template.landmarks.items():
+        moved = turned is not None and np.linalg.norm(turned(placed[i]) - placed[i]) > 2 * ALIKE_M
+        sure = 0.5 * probability if moved else probability
         near = (
             seen[
                 np.sort(
@@ -160,10 +165,23 @@ def landmarks(
             if tree is not None
             else seen
         )
-        result.append(
-            _landmark(name, placed[i], float(sigma[i]), points, near, probability, config)
-        )
+        result.append(_landmark(name, placed[i], float(sigma[i]), points, near, sure, config))
     return tuple(result)
+
+
+def turned_alike(fit: Fit) -> Callable[[Float], Float] | None:
+    """Half a turn after which the fitted outline looks the same; None if none does."""
+    outline = fit.points()[: fit.template.vertices]
+    step = np.roll(outline, -1, axis=0) - outline
+    weight = np.linalg.norm(step, axis=1)
+    middle = (weight[:, None] * (outline + step / 2)).sum(axis=0) / weight.sum()
+    line = outline.astype(np.float32)
+    off = [
+        abs(cv2.pointPolygonTest(line, (float(u), float(v)), True)) for u, v in 2 * middle - outline
+    ]
+    if max(off) > ALIKE_M:
+        return None
+    return lambda uv: 2 * middle - uv
 
 
 def _landmark(
@@ -220,6 +238,7 @@ def _quality(
 
 def _notices(
     recognition: Recognition,
+    fit: Fit,
     measurements: tuple[Measurement, ...],
     coverage: float,
     quality: float,
@@ -240,6 +259,9 @@ def _notices(
     if len(order) > 1 and order[1][1] > 0.2:
         text = f"{order[0][0]} {order[0][1]:.2f}, {order[1][0]} {order[1][1]:.2f}"
         notices.append(Notice("category_uncertain", text))
+    if turned_alike(fit) is not None:
+        text = f"{recognition.category}: both ends look alike, their names may be exchanged"
+        notices.append(Notice("ends_alike", text))
     if quality < config.trusted_quality:
         notices.append(Notice("untrusted", f"quality {quality:.2f}: do not use the sizes"))
     return tuple(notices)

@@ -274,6 +274,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "low_coverage": "much of the item was not seen",
     "hidden_crease": "a deep crease probably hides cloth",
     "category_uncertain": "two categories fit nearly as well",
+    "ends_alike": "turned by half a turn the item looks the same: its ends' names may be exchanged",
     "solution_uncertain": "the item may lie otherwise, with another width or length",
     "correspondence_rejected": "a corresponding point contradicts the others",
     "views_misplaced": "a print on the cloth contradicts the registration of the views",

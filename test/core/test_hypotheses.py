@@ -9,10 +9,14 @@ import pytest
 from vflatten_ros.core.hypotheses import Tried
 
 
-def tried(share=1.0, overlap=0.0, category="towel", misfit=-0.5, explained=1.0, aside=0.0):
+def tried(
+    share=1.0, overlap=0.0, category="towel", misfit=-0.5, explained=1.0, aside=0.0, sure=1.0
+):
     unfolded = SimpleNamespace(share=share, overlap=overlap)
     found = SimpleNamespace(
-        category=category, fit=SimpleNamespace(misfit=misfit, explained=explained)
+        category=category,
+        probabilities={"towel": sure, "skirt": 1.0 - sure, "unknown": 0.0},
+        fit=SimpleNamespace(misfit=misfit, explained=explained),
     )
     return Tried(unfolded, found, aside)
 
@@ -26,6 +30,7 @@ def test_all_that_is_wrong_with_a_way_counts():
         tried(category="unknown"),
         tried(misfit=0.2),
         tried(explained=0.7),
+        tried(sure=0.5),
     ]
     assert all(way.badness > good + 0.4 for way in worse)
     assert tried(share=0.95, overlap=0.04, explained=0.96).badness == good  # as any result has
@@ -38,6 +43,7 @@ def test_a_large_piece_left_aside_is_worse_than_as_many_shreds():
 
 def test_a_way_that_fits_nothing_is_the_worst():
     nothing = Tried(
-        SimpleNamespace(share=1.0, overlap=0.0), SimpleNamespace(category="unknown", fit=None)
+        SimpleNamespace(share=1.0, overlap=0.0),
+        SimpleNamespace(category="unknown", probabilities={"unknown": 1.0}, fit=None),
     )
     assert nothing.badness == float("inf")

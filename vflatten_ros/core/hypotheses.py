@@ -39,14 +39,14 @@ WHOLE = "whole"
 WAYS = (  # how, greatest doubt, badness of what was tried before below which it is left out
     (WHOLE, np.inf, -np.inf),
     (PUZZLE, 1.0, -0.5),
-    (WHOLE, 1.0, 0.1),
-    (CLOSED, 1.0, 0.1),
-    (PUZZLE, 0.4, 0.1),
+    (WHOLE, 1.0, 0.05),
+    (CLOSED, 1.0, 0.05),
+    (PUZZLE, 0.4, 0.05),
 )
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
-ASIDE = 2.0  # of the share that is left out in large groups, beside: it can be no noise
+ASIDE = 3.0  # of the share that is left out in large groups, beside: it can be no noise
 WORTH_PLACING = 0.1  # share of the samples of a group
 PLACED_WAYS = 2  # categories by which groups are placed that are looked at
 
@@ -61,7 +61,7 @@ class Tried:
 
     @property
     def badness(self) -> float:
-        """How badly the best category fits, how far from flat it lies, what it leaves out.
+        """How badly and unsurely a category fits, how far from flat it lies, what is left out.
 
         A garment laid flat has one layer of either side everywhere; more say that layers were
         joined that are not. A piece alone may look like a whole item of another kind.
@@ -72,7 +72,10 @@ class Tried:
         explained = self.found.fit.explained if self.found.fit is not None else 0.0
         odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD
         left_out += ASIDE * self.aside
-        return float(misfit + folded + left_out + odd + (self.found.category == UNKNOWN))
+        known = [p for name, p in self.found.probabilities.items() if name != UNKNOWN]
+        unsure = 1.0 - max(known, default=0.0)
+        unknown = float(self.found.category == UNKNOWN)
+        return float(misfit + folded + left_out + odd + unsure + unknown)
 
 
 def likeliest(

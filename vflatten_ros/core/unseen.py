@@ -1,6 +1,6 @@
 """What each view adds, where cloth goes on unseen, what angle would show it, and when to stop.
 
-Cloth goes on unseen where another sheet lies in front of the end of what was seen, and where it
+Cloth goes on unseen where no camera that sees the end of a sheet looks past it, and where it
 turns away from all cameras that saw it. Under a sheet one looks from the side that lies open;
 round a bend one looks from beyond it. Where a view was taken from there already, turning shows no
 more.

@@ -42,8 +42,8 @@ from vflatten_ros.worker import KEPT_BYTES
 PAGE = ROOT / "docs" / "benchmarks.md"
 ABOUT = """
 Written by `python3 benchmarks/last_view.py RECORDING ... --docs`: wall seconds of `rotation` after
-the views are prepared, the best of some rounds. Where two tries are made at once, a stage's time is
-that of the try which was waited for.
+the views are prepared, the best of some rounds. Stages that every way of laying the item flat goes
+through are summed over the ways that it took.
 """
 TOGETHER = {
     "register, fuse": ("surface", "register", "fuse"),

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RecognitionConfig
 from vflatten_ros.core.errors import InvalidInput
-from vflatten_ros.core.geometry import twice_area
+from vflatten_ros.core.geometry import loop_normals, twice_area
 from vflatten_ros.core.templates import Float
 from vflatten_ros.core.values import Bool, FlatPoints, Int, Outline
 
@@ -90,7 +90,7 @@ def evidence_from(outline: Outline, points: FlatPoints, config: RecognitionConfi
     depth = sample(distance, (points.uv - origin) / CELL_M)
     rim = np.flatnonzero(~points.inferred & (depth > -RIM_M))
     rim = rim[np.linspace(0, len(rim) - 1, min(len(rim), SAMPLES)).astype(int)]
-    normal = _normals(uv)
+    normal = loop_normals(uv)
     gap = _across_gaps(uv, normal, origin, distance)
     return Evidence(
         outline=uv,
@@ -179,14 +179,6 @@ def _evenly(outline: Outline, count: int) -> Outline:
     sigma = np.interp(wanted, at, np.r_[outline.sigma_m, outline.sigma_m[0]])
     inferred = np.interp(wanted, at, np.r_[outline.inferred, outline.inferred[0]].astype(float))
     return Outline(uv, sigma, inferred > 0.5)
-
-
-def _normals(uv: Float) -> Float:
-    """Outward normals of a closed outline, over five points."""
-    along = np.roll(uv, -2, axis=0) - np.roll(uv, 2, axis=0)
-    outward = np.column_stack([along[:, 1], -along[:, 0]])
-    normals: Float = outward / np.maximum(np.linalg.norm(outward, axis=1), 1e-9)[:, None]
-    return normals
 
 
 def _distance_image(

@@ -78,6 +78,14 @@ def twice_area(uv: Float) -> float:
     return float((uv[:, 0] * after[:, 1] - uv[:, 1] * after[:, 0]).sum())
 
 
+def loop_normals(uv: Float) -> Float:
+    """(n, 2) unit outward normals of a closed line (n, 2), counter-clockwise, over five points."""
+    along = np.roll(uv, -2, axis=0) - np.roll(uv, 2, axis=0)
+    outward = np.column_stack([along[:, 1], -along[:, 0]])
+    normals: Float = outward / np.maximum(np.linalg.norm(outward, axis=1), 1e-9)[:, None]
+    return normals
+
+
 def thinned_loop(uv: Float, reach: int = 2) -> Float:
     """Every second point of a closed line (n, 2), each the mean of those up to `reach` away."""
     smooth: Float = np.mean([np.roll(uv, k, axis=0) for k in range(-reach, reach + 1)], axis=0)

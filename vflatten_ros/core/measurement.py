@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -151,10 +150,10 @@ def landmarks(
     sigma = np.sqrt(variance.mean(axis=1))
     seen = np.nonzero(~points.inferred)[0]
     tree = cKDTree(points.uv[seen]) if len(seen) else None
-    turned = turned_alike(fit)
+    middle = half_turn_about(fit)
     result = []
     for name, i in fit.template.landmarks.items():
-        moved = turned is not None and np.linalg.norm(turned(placed[i]) - placed[i]) > 2 * ALIKE_M
+        moved = middle is not None and np.linalg.norm(placed[i] - middle) > ALIKE_M
         sure = 0.5 * probability if moved else probability
         near = (
             seen[
@@ -169,19 +168,16 @@ def landmarks(
     return tuple(result)
 
 
-def turned_alike(fit: Fit) -> Callable[[Float], Float] | None:
-    """Half a turn after which the fitted outline looks the same; None if none does."""
+def half_turn_about(fit: Fit) -> Float | None:
+    """(2,) point about which half a turn leaves the fitted outline as it is; None if none does."""
     outline = fit.points()[: fit.template.vertices]
     step = np.roll(outline, -1, axis=0) - outline
     weight = np.linalg.norm(step, axis=1)
-    middle = (weight[:, None] * (outline + step / 2)).sum(axis=0) / weight.sum()
+    middle: Float = (weight[:, None] * (outline + step / 2)).sum(axis=0) / weight.sum()
     line = outline.astype(np.float32)
-    off = [
-        abs(cv2.pointPolygonTest(line, (float(u), float(v)), True)) for u, v in 2 * middle - outline
-    ]
-    if max(off) > ALIKE_M:
-        return None
-    return lambda uv: 2 * middle - uv
+    turned = 2 * middle - outline
+    off = [abs(cv2.pointPolygonTest(line, (float(u), float(v)), True)) for u, v in turned]
+    return middle if max(off) < ALIKE_M else None
 
 
 def _landmark(
@@ -259,7 +255,7 @@ def _notices(
     if len(order) > 1 and order[1][1] > 0.2:
         text = f"{order[0][0]} {order[0][1]:.2f}, {order[1][0]} {order[1][1]:.2f}"
         notices.append(Notice("category_uncertain", text))
-    if turned_alike(fit) is not None:
+    if half_turn_about(fit) is not None:
         text = f"{recognition.category}: both ends look alike, their names may be exchanged"
         notices.append(Notice("ends_alike", text))
     if quality < config.trusted_quality:

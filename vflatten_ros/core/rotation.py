@@ -19,6 +19,7 @@ from vflatten_ros.core.distances import Distances, Steps, link_steps, surface_di
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.fusion import Samples, fuse
 from vflatten_ros.core.geometry import (
+    loop_normals,
     thinned_loop,
     transform_directions,
     transform_points,
@@ -529,9 +530,7 @@ def _before_an_end(contour: Float, inferred: Bool) -> Bool:
 
     Between two legs, one leg hangs before the edge of the other; no cloth goes on there.
     """
-    normal = np.roll(contour, -2, axis=0) - np.roll(contour, 2, axis=0)
-    normal = np.column_stack([normal[:, 1], -normal[:, 0]])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    normal = loop_normals(contour)
     i, j = cKDTree(contour).query_pairs(SLIT_M, output_type="ndarray").T
     across = contour[j] - contour[i]
     size = np.linalg.norm(across, axis=1)

@@ -253,11 +253,15 @@ def overlap(a: Float, b: Float) -> float:
 
 
 def landmark_error(truth: Mapping[str, Any], result: Mapping[str, Any]) -> float | None:
-    """Median distance of the hanging landmarks that some view shows; left and right may change."""
+    """Median distance of the hanging landmarks that some view shows.
+
+    Left and right may be exchanged, all together: front and back look alike. The naming with the
+    smaller mean counts, of those that name the most.
+    """
     rotation, shift = (np.array(truth["wrist_to_optical"][key]) for key in "Rt")
     given = {m["name"]: m["xyz"] for m in result.get("landmarks", ()) if m["xyz"] is not None}
     mirrored = {"left": "right", "right": "left"}
-    medians = []
+    namings = []
     for swap in (False, True):
         found = []
         for name, mark in truth["landmarks"].items():
@@ -266,9 +270,10 @@ def landmark_error(truth: Mapping[str, Any], result: Mapping[str, Any]) -> float
             if any(mark["visible"]) and asked in given:
                 true = rotation @ np.array(mark["hanging"]) + shift
                 found.append(float(np.linalg.norm(np.array(given[asked]) - true)))
-        if found:
-            medians.append(float(np.median(found)))
-    return min(medians, default=None)
+        namings.append(found)
+    most = max(map(len, namings))
+    best = min((n for n in namings if n and len(n) == most), key=np.mean, default=None)
+    return None if best is None else float(np.median(best))
 
 
 def section(title: str, rows: Sequence[Row], pictures: str) -> list[str]:

@@ -158,12 +158,12 @@ def _lines(views: list[View]) -> GeodesicLines:
 
 
 def _landmarks() -> tuple[Landmark, ...]:
-    upper = np.array([[-WIDTH_M / 2, 0.0], [WIDTH_M / 2, 0.0]])
-    left, right = (tuple(float(v) for v in row) for row in hang(upper))
+    flat = np.array([[-WIDTH_M / 2, 0.0], [WIDTH_M / 2, 0.0], [-WIDTH_M / 2, -0.4]])
+    left, right, lowest = (tuple(float(v) for v in row) for row in hang(flat))
     return (
         Landmark("left_top_corner", (-0.15, 0.0), 0.003, left, 0.004, (5,), 0.9),  # type: ignore[arg-type]
         Landmark("right_top_corner", (0.15, 0.0), 0.003, right, 0.004, (2,), 0.9),  # type: ignore[arg-type]
-        Landmark("left_bottom_corner", (-0.15, -0.5), 0.02, None, 0.0, (), 0.2),
+        Landmark("left_bottom_corner", (-0.15, -0.5), 0.02, lowest, 0.102, (), 0.2),  # type: ignore[arg-type]
     )
 
 

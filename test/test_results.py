@@ -69,12 +69,20 @@ def test_landmarks_hang_in_the_rig_frame_with_the_item_turned_back_to_zero():
     assert mark["view"] == 2
 
 
-def test_an_unseen_landmark_hangs_nowhere():
+def test_an_unseen_landmark_hangs_somewhere_near_the_cloth_beside_it():
     mark = RESULT["landmarks"][2]
     assert mark["name"] == "left_bottom_corner"
-    assert mark["xyz"] is None
+    assert not mark["seen"] and RESULT["landmarks"][0]["seen"]
+    assert len(mark["xyz"]) == 3 and mark["xyz_sigma_m"] == pytest.approx(0.102)
     assert mark["view"] is None
     assert mark["uv"] == [-0.15, -0.5]
+
+
+def test_a_landmark_hangs_nowhere_where_nothing_was_seen():
+    bare = dataclasses.replace(GARMENT.landmarks[2], xyz_hanger=None, xyz_sigma_m=float("nan"))
+    garment = dataclasses.replace(GARMENT, landmarks=(bare,))
+    mark = results.garment_result(garment, VIEWS)["landmarks"][0]
+    assert mark["xyz"] is None and mark["xyz_sigma_m"] is None and not mark["seen"]
 
 
 def test_numbers_equal_the_message_fields_exactly():

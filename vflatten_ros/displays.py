@@ -197,7 +197,7 @@ def _sizes(garment: FlatGarment, header: Fields, place: Any) -> Fields:
 
 
 def _landmarks(garment: FlatGarment, header: Fields, T_rig_hanger: Float) -> list[Fields]:
-    seen = [mark for mark in garment.landmarks if mark.xyz_hanger is not None]
+    seen = [mark for mark in garment.landmarks if mark.seen]
     xyz = np.array([mark.xyz_hanger for mark in seen], dtype=float).reshape(-1, 3)
     points = transform_points(T_rig_hanger, xyz)
     markers = [_marker(header, "landmarks", 0, _SPHERE_LIST, points, scale=0.014, colour=ORANGE)]

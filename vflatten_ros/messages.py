@@ -161,10 +161,10 @@ def measurement_fields(measurement: Measurement) -> Fields:
 
 
 def landmark_fields(landmark: Landmark) -> Fields:
-    """vflatten_ros/Landmark; an unseen landmark's position is the origin."""
+    """vflatten_ros/Landmark; the origin, with no sigma, where nothing of the item was seen."""
     return {
         "name": landmark.name,
-        "seen": landmark.xyz_hanger is not None,
+        "seen": landmark.seen,
         "u": float(landmark.uv[0]),
         "v": float(landmark.uv[1]),
         "uv_sigma": float(landmark.uv_sigma_m),

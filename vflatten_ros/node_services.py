@@ -198,8 +198,9 @@ class Services:
             raise Refused(NO_RESULT, "nothing has been flattened yet; send a Flatten goal first")
         mark = _landmark(garment, request.name)
         angle = _angle(session, request)
+        unseen = f"no view shows {mark.name!r}; turn the item and flatten again"
         if mark.xyz_hanger is None:
-            raise Refused(NOT_SEEN, f"no view shows {mark.name!r}; turn the item and flatten again")
+            raise Refused(NOT_SEEN, unseen)
         xyz = transform_points(session.calibration.T_rig_hanger(angle), np.array(mark.xyz_hanger))
         frame = session.calibration.frame
         if request.frame_id not in ("", frame):
@@ -213,6 +214,8 @@ class Services:
         response.sigma = float(mark.xyz_sigma_m)
         response.certainty = float(mark.certainty)
         response.views = list(mark.views)
+        if not mark.seen:
+            raise Refused(NOT_SEEN, f"{unseen}; the position is the nearest cloth that one shows")
 
     # ---- flattening
 

@@ -38,7 +38,7 @@ def draw_flat(garment: FlatGarment) -> Byte:
         if size is not None:
             canvas.size(size)
     for mark in garment.landmarks:
-        colour = ORANGE if mark.xyz_hanger is None else BLACK
+        colour = BLACK if mark.seen else ORANGE
         canvas.mark(np.array(mark.uv), mark.name, colour)
     canvas.title(_titles(garment))
     return canvas.image

@@ -128,15 +128,17 @@ def _measurement(fields: Mapping[str, Any]) -> Result:
 
 def _landmark(fields: Mapping[str, Any], T_rig_hanger0: Float) -> Result:
     hanging = np.array([fields["position"][axis] for axis in "xyz"], dtype=np.float64)
-    seen = bool(fields["seen"])
+    sigma_m = float(fields["position_sigma"])
+    placed = bool(np.isfinite(sigma_m))
     views = [int(i) for i in fields["views"]]
     return {
         "name": fields["name"],
         "uv": [float(fields["u"]), float(fields["v"])],
         "uv_sigma_m": float(fields["uv_sigma"]),
-        "xyz": transform_points(T_rig_hanger0, hanging).tolist() if seen else None,
-        "xyz_sigma_m": float(fields["position_sigma"]) if seen else None,
-        "view": views[0] if seen and views else None,
+        "seen": bool(fields["seen"]),
+        "xyz": transform_points(T_rig_hanger0, hanging).tolist() if placed else None,
+        "xyz_sigma_m": sigma_m if placed else None,
+        "view": views[0] if views else None,
         "views": views,
         "certainty": float(fields["certainty"]),
     }

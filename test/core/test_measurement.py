@@ -76,6 +76,20 @@ def test_a_length_whose_end_no_view_shows_is_flagged_and_uncertain():
     assert size["width"].sigma_m < 0.02 * WIDTH_M  # what is seen stays certain
 
 
+def test_a_landmark_that_no_view_shows_hangs_no_farther_from_seen_cloth_than_it_lies():
+    outline, points = rectangle(top_seen=True), cloth(2)
+    hidden = np.linalg.norm(points.uv, axis=1) < 0.08  # by the fingers that hold the corner
+    points = dataclasses.replace(points, inferred=hidden)
+    found = recognise(outline, points, TOWEL, RecognitionConfig())
+    marks = measure(found, outline, points, MeasurementConfig()).landmarks
+    corner = [mark for mark in marks if not mark.seen]
+    assert len(marks) >= 4 and len(corner) == 1
+    assert corner[0].uv == pytest.approx((0.0, 0.0), abs=0.004)
+    off = np.linalg.norm(np.array(corner[0].xyz_hanger) - [*corner[0].uv, 0.0])  # hangs as it lies
+    assert 0.07 < off <= corner[0].xyz_sigma_m < 0.1
+    assert corner[0].views == () and corner[0].certainty < 0.25
+
+
 def test_a_strip_that_reaches_beyond_an_unseen_end_does_not_show_it():
     inner = WIDTH_M - 0.04
     corners = np.array(

@@ -114,6 +114,9 @@ def test_landmarks_turn_with_the_wrist(rig):
     for name, code in (("left_ear", "UNKNOWN_NAME"), ("left_bottom_corner", "NOT_SEEN")):
         answer = rig.ask("locate_landmark", name=name)
         assert answer.status.code == getattr(msg.Status, code)
+    assert "nearest cloth" in answer.status.message
+    assert abs(answer.sigma - 0.102) < 1e-6 and not answer.views
+    assert answer.position.header.frame_id == "rig_optical"
     elsewhere = rig.ask("locate_landmark", name="left_top_corner", frame_id="base_link")
     assert elsewhere.status.code == msg.Status.UNKNOWN_NAME
     assert "tf2_ros" in elsewhere.status.message or "transform" in elsewhere.status.message

@@ -144,7 +144,11 @@ def covered(fit: Fit, points: FlatPoints) -> float:
 def landmarks(
     fit: Fit, points: FlatPoints, probability: float, config: MeasurementConfig
 ) -> tuple[Landmark, ...]:
-    """Every named point: its flat place from the fit, its hanging place from what was seen."""
+    """Every named point: its flat place from the fit, its hanging place from what was seen.
+
+    One that no view shows hangs no farther from the nearest cloth that was seen than it lies from
+    it laid flat: that cloth is its place, as uncertain as it is far.
+    """
     placed, slope = place(fit.template, fit.pose, fit.state)
     variance = np.einsum("pim,mn,pin->pi", slope, fit.covariance, slope)
     sigma = np.sqrt(variance.mean(axis=1))
@@ -191,7 +195,8 @@ def _landmark(
 ) -> Landmark:
     if not len(near):
         certainty = 0.25 * probability * float(np.exp(-((sigma / 0.05) ** 2)))
-        return Landmark(name, _pair(at), sigma, None, float("nan"), (), certainty)
+        place_3d, xyz_sigma = _cloth_nearest(at, sigma, points)
+        return Landmark(name, _pair(at), sigma, place_3d, xyz_sigma, (), certainty)
     distance = np.linalg.norm(points.uv[near] - at, axis=1)
     layer = _layer(points.xyz_hanger[near], distance, config.layer_gap_m)
     near, distance = near[layer], distance[layer]
@@ -203,8 +208,23 @@ def _landmark(
     ids = points.view_id[near]
     views = sorted({int(v) for v in ids if v >= 0}, key=lambda v: (distance[ids == v].min(), v))
     certainty = probability * float(np.exp(-((xyz_sigma / 0.05) ** 2)))
-    place_3d = (float(xyz[0]), float(xyz[1]), float(xyz[2]))
-    return Landmark(name, _pair(at), sigma, place_3d, xyz_sigma, tuple(views), certainty)
+    return Landmark(name, _pair(at), sigma, _triple(xyz), xyz_sigma, tuple(views), certainty)
+
+
+def _cloth_nearest(
+    at: Float, sigma: float, points: FlatPoints
+) -> tuple[tuple[float, float, float] | None, float]:
+    """Where the cloth that was seen nearest to a flat place hangs, and how far off that may be."""
+    seen = np.flatnonzero(~points.inferred)
+    if not len(seen):
+        return None, float("nan")
+    distance = np.linalg.norm(points.uv[seen] - at, axis=1)
+    nearest = int(distance.argmin())
+    return _triple(points.xyz_hanger[seen[nearest]]), float(np.hypot(sigma, distance[nearest]))
+
+
+def _triple(xyz: Float) -> tuple[float, float, float]:
+    return float(xyz[0]), float(xyz[1]), float(xyz[2])
 
 
 def _layer(xyz: Float, distance: Float, gap: float) -> Float:

@@ -254,10 +254,15 @@ class Landmark:
     name: str
     uv: tuple[float, float]  # flat frame
     uv_sigma_m: float
-    xyz_hanger: tuple[float, float, float] | None  # None: unseen
+    xyz_hanger: tuple[float, float, float] | None  # unseen: the cloth nearest to it that was seen
     xyz_sigma_m: float
-    views: tuple[int, ...]  # view_ids that show it, best first
+    views: tuple[int, ...]  # view_ids that show it, best first; none: unseen
     certainty: float  # 0-1
+
+    @property
+    def seen(self) -> bool:
+        """Whether a view shows it."""
+        return bool(self.views)
 
 
 @dataclass(frozen=True)

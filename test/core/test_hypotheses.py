@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from vflatten_ros.core.hypotheses import Tried
+from vflatten_ros.core.hypotheses import Tried, settled
 
 
 def tried(
@@ -47,3 +47,12 @@ def test_a_way_that_fits_nothing_is_the_worst():
         SimpleNamespace(category="unknown", probabilities={"unknown": 1.0}, fit=None),
     )
     assert nothing.badness == float("inf")
+
+
+def test_one_good_way_settles_it_unless_the_category_is_unsure():
+    good, unsure, bad = tried(misfit=-0.5), tried(misfit=-0.5, sure=0.9), tried(misfit=0.5)
+    assert settled([good], -0.15)
+    assert not settled([unsure], -0.15)
+    assert settled([bad, unsure], -0.15) and settled([unsure, good], -0.15)
+    assert not settled([bad], -0.15) and not settled([bad, bad], -0.15)
+    assert not settled([], -0.15)

@@ -26,6 +26,7 @@ PLACED_BY = 10  # landmarks that place a sample
 LEAST_INSIDE = 0.4  # of the samples in the largest piece
 FIRM_LINKS = 6  # links on the sheet that a landmark needs
 GROUP = 16  # landmarks whose paths are laid out together: bounds the memory
+MEET_AT = 2  # every such sample is one where paths may meet: laid out, they are straight anyhow
 BLOCK = 512  # samples whose nearest landmarks are found together, so that they stay in the cache
 STRAIGHT_LEAST = 0.4  # a chain whose ends are nearer than this share of it tells too little
 ZIGZAG = 1.03  # how much longer paths over links are than the straight lines
@@ -196,7 +197,8 @@ def surface_distances(
     reach_m = (config.local_m + link_m) / 2  # two paths meet half way
     chosen, paths, before = _landmarks(graph, firm, config.landmarks, reach_m, progress)
     progress("distances", 0.5)
-    one, other, middle, _ = _meetings(paths, passable, config.local_m, link_m)
+    meet = passable & (np.arange(count) % MEET_AT == 0)
+    one, other, middle, _ = _meetings(paths, meet, config.local_m, link_m)
     around = _nearest(paths, min(PLACED_BY, len(chosen) - 1))
     reached = around >= 0
     progress("distances", 0.6)
@@ -277,7 +279,7 @@ def _nearest(paths: csr_matrix, count: int) -> Int:
 
 
 def _meetings(
-    paths: csr_matrix, passable: Bool, most_m: float, link_m: float
+    paths: csr_matrix, meet: Bool, most_m: float, link_m: float
 ) -> tuple[Int, Int, Int, Float32]:
     """Pairs of landmarks that a path joins, the sample half way where theirs meet, its length.
 
@@ -285,7 +287,8 @@ def _meetings(
     ----------
     paths : csr_matrix of shape (k, n)
         Lengths from the landmarks to samples within half of what is asked, and a link more.
-    passable : ndarray of shape (n,)
+    meet : ndarray of shape (n,)
+        Samples where paths may meet.
     most_m : float
         Longest path.
     link_m : float
@@ -294,12 +297,12 @@ def _meetings(
     count, by_sample = paths.shape[0], paths.tocsc()
     least = np.full(count * count, most_m, dtype=np.float32)
     middle = np.full(count * count, -1)
-    for start in range(0, len(passable), BLOCK):
+    for start in range(0, len(meet), BLOCK):
         ends = by_sample.indptr[start : start + BLOCK + 1]
         known = slice(ends[0], ends[-1])
         sample = np.repeat(np.arange(start, start + len(ends) - 1), np.diff(ends))
         length, landmark = by_sample.data[known], by_sample.indices[known]
-        through = passable[sample]
+        through = meet[sample]
         sample, length, landmark = sample[through], length[through], landmark[through]
         key = sample * (2 * most_m) + length
         order = np.argsort(key, kind="stable")

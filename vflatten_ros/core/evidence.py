@@ -128,12 +128,17 @@ def _gaps(points: FlatPoints, origin: Float, body: NDArray[np.uint8]) -> NDArray
     uv, xyz = points.uv[seen], points.xyz_hanger[seen]
     tree = cKDTree(uv)
     spacing = float(np.quantile(tree.query(uv, k=2)[0][:, 1], 0.75))
-    pairs = tree.query_pairs(max(0.010, 3.0 * spacing), output_type="ndarray")
+    reach_m = max(0.010, 3.0 * spacing)
+    pairs = tree.query_pairs(reach_m, output_type="ndarray")
     flat = np.linalg.norm(uv[pairs[:, 0]] - uv[pairs[:, 1]], axis=1)
     free = np.linalg.norm(xyz[pairs[:, 0]] - xyz[pairs[:, 1]], axis=1)
-    ends = _cells(uv, origin)[pairs[free < 1.3 * flat + 0.005]]
+    ends = ((uv - origin) / CELL_M)[pairs[free < 1.3 * flat + 0.005]]
     cloth = np.zeros_like(body)
-    cv2.polylines(cloth, list(ends), isClosed=False, color=(1,), shift=4)
+    share = np.linspace(0.0, 1.0, int(np.ceil(reach_m / CELL_M)) + 1)[:, None, None]
+    along = np.rint(ends[:, 0] + share * (ends[:, 1] - ends[:, 0])).astype(np.intp)
+    inside = ((along >= 0) & (along < body.shape[::-1])).all(axis=-1)  # strays lie beyond
+    col, row = along[inside].T
+    cloth[row, col] = 1
     reach = 2 * int(np.ceil(max(0.004, 1.5 * spacing) / CELL_M)) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     bare = ((body > 0) & (cv2.dilate(cloth, disc) == 0)).astype(np.uint8)

@@ -97,25 +97,29 @@ def _fit(
     config: RotationConfig,
 ) -> tuple[Float, Float, Float, Int, Bool]:
     """Move samples onto their own layer by local fits: planes first, a quadric last."""
-    radius = config.fit_m
+    radius, start = config.fit_m, at
     distance, near = tree.query(at, k=NEIGHBOURS, distance_upper_bound=radius * 1.2)
     found = np.isfinite(distance)
     near = np.where(found, near, 0)
-    around, their_normals = points[near], normals[near]
+    # a nanometre in a centimetre is enough: half the memory to go through
+    around = (points[near] - start[:, None]).astype(np.float32)
+    their_normals = normals[near].astype(np.float32)
     for band in BANDS_M:
-        alike = np.matmul(their_normals, normal[..., None])[..., 0] > 0.5
         e1, e2 = tangents(normal)
-        local = np.matmul(around - at[:, None], np.stack([e1, e2, normal], axis=-1))
+        frame = np.stack([e1, e2, normal], axis=-1).astype(np.float32)
+        alike = np.matmul(their_normals, frame[..., 2:])[..., 0] > 0.5
+        local = np.matmul(around - (at - start)[:, None].astype(np.float32), frame)
         x, y, height = local[..., 0] / radius, local[..., 1] / radius, local[..., 2]
         weight = (1 - (x * x + y * y).clip(0, 1)) ** 2 * np.exp(-0.5 * (height / band) ** 2)
-        weight = np.where(found & alike, weight, 0.0)
+        weight = np.where(found & alike, weight, np.float32(0.0))
         basis = [np.ones_like(x), x, y]
         if band == BANDS_M[-1]:
             basis += [x * x, x * y, y * y]
         design = np.stack(basis, axis=1)  # (n, terms, k)
         weighted = design * weight[:, None]
         matrix = weighted @ design.transpose(0, 2, 1) + 1e-3 * np.eye(len(basis))
-        solved = np.linalg.solve(matrix, weighted @ height[..., None])[..., 0]
+        right = (weighted @ height[..., None]).astype(np.float64)
+        solved = np.linalg.solve(matrix, right)[..., 0]
         at = at + solved[:, :1] * normal
         normal = normal - (solved[:, 1:2] * e1 + solved[:, 2:3] * e2) / radius
         normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)

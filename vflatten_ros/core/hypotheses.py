@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 
 import numpy as np
 
@@ -22,11 +22,11 @@ from vflatten_ros.core.grouping import (
     put_beside,
     unfold_group,
 )
+from vflatten_ros.core.parallel import beside
 from vflatten_ros.core.placing import Group, place_groups
 from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
 from vflatten_ros.core.rotation import (
     Fused,
-    Surface,
     Unfolded,
     doubts,
     link_surface,
@@ -38,11 +38,12 @@ from vflatten_ros.core.values import Progress
 WHOLE = "whole"
 WAYS = (  # how, greatest doubt, badness of what was tried before below which it is left out
     (WHOLE, np.inf, -np.inf),
-    (PUZZLE, 1.0, -0.5),
+    (PUZZLE, 1.0, -0.15),
     (WHOLE, 1.0, 0.05),
     (CLOSED, 1.0, 0.05),
     (PUZZLE, 0.4, 0.05),
 )
+SURE = 0.97  # probability of a category below which one way alone is not believed
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
@@ -72,10 +73,14 @@ class Tried:
         explained = self.found.fit.explained if self.found.fit is not None else 0.0
         odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD
         left_out += ASIDE * self.aside
-        known = [p for name, p in self.found.probabilities.items() if name != UNKNOWN]
-        unsure = 1.0 - max(known, default=0.0)
         unknown = float(self.found.category == UNKNOWN)
-        return float(misfit + folded + left_out + odd + unsure + unknown)
+        return float(misfit + folded + left_out + odd + 1.0 - self.sure + unknown)
+
+    @property
+    def sure(self) -> float:
+        """Probability of the likeliest category."""
+        known = [p for name, p in self.found.probabilities.items() if name != UNKNOWN]
+        return max(known, default=0.0)
 
 
 def likeliest(
@@ -95,7 +100,7 @@ def likeliest(
     failures: list[DisconnectedSurface] = []
     ways = _Ways(fused, templates, config, progress)
     for how, doubt, enough in WAYS:
-        if min((tried.badness for tried in tries), default=np.inf) < enough:
+        if settled(tries, enough):
             break
         try:
             tries.append(ways.tried(how, doubt))
@@ -103,6 +108,17 @@ def likeliest(
             failures.append(error)
     if not tries:
         raise failures[0]
+    return _best(tries)
+
+
+def settled(tries: Sequence[Tried], enough: float) -> bool:
+    """Whether what was tried is good enough: below a badness, and sure or not by one way alone."""
+    if not tries or _best(tries).badness >= enough:
+        return False
+    return len(tries) > 1 or tries[0].sure >= SURE
+
+
+def _best(tries: Sequence[Tried]) -> Tried:
     return min(tries, key=lambda tried: tried.badness)
 
 
@@ -116,19 +132,11 @@ class _Ways:
         config: Config,
         progress: Progress,
     ) -> None:
-        self._fused, self._templates = fused, templates
-        self._config, self._progress = config, progress
+        self._templates, self._config, self._progress = templates, config, progress
         self._grouped: dict[float, Grouped] = {}
-
-    @cached_property
-    def _linked(self) -> Surface:
-        return link_surface(self._fused, self._config.rotation, self._progress)
-
-    @cached_property
-    def _doubted(self) -> Surface:
-        linked = self._linked
-        doubt = doubts(self._fused, self._config.rotation, self._progress)
-        return replace(linked, doubt=doubt)
+        with beside(partial(doubts, fused, config.rotation)) as doubt:
+            self._linked = link_surface(fused, config.rotation, progress)
+        self._doubted = replace(self._linked, doubt=doubt.result())
 
     def tried(self, how: str, doubt: float) -> Tried:
         """One of WAYS.
@@ -167,7 +175,7 @@ def _from_groups(
             only = tuple(t for t in templates if t.category == placing.template.category)
             tried = _recognised(beside, only, config, progress)
             tries.append(replace(tried, found=_among(tried.found, odds)))
-    return min(tries, key=lambda tried: tried.badness)
+    return _best(tries)
 
 
 def _among(found: Recognition, odds: Mapping[str, float]) -> Recognition:

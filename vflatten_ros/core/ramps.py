@@ -55,7 +55,7 @@ def ramps(
         through samples of more than 1.
     """
     progress("ramps", 0.0)
-    tilt = _tilt(xyz, normal)
+    tilt = _tilt(xyz, normal, progress)
     steep = np.flatnonzero(tilt * STEP_HEIGHT_M > config.ramp)
     tree = cKDTree(points[::2], balanced_tree=False, compact_nodes=False)
     step = np.zeros(len(xyz))
@@ -71,17 +71,21 @@ def ramps(
     return found
 
 
-def _tilt(xyz: Float, normal: Float) -> Float:
+def _tilt(xyz: Float, normal: Float, progress: Progress) -> Float:
     """Angle of each normal to the mean of those on both sides of it, 0 where a side is missing."""
     pairs = cKDTree(xyz).query_pairs(RING_M[1], output_type="ndarray").astype(np.int32)
-    parts = [_ring(pairs[k : k + PAIRS], xyz, normal) for k in range(0, len(pairs), PAIRS)]
+    parts = []
+    for k in range(0, len(pairs), PAIRS):
+        progress("ramps", 0.2 * k / len(pairs))
+        parts.append(_ring(pairs[k : k + PAIRS], xyz, normal))
     i, j = np.concatenate(parts).T if parts else pairs.T
     chord = xyz[j]
     chord -= xyz[i]
     length = np.linalg.norm(chord, axis=1)
     count = len(xyz)
     mean = _unit(_summed(i, normal[j], count) + _summed(j, normal[i], count))
-    for _ in range(2):  # the direction of the tilt depends on the mean, and it on the direction
+    for done in range(2):  # the direction of the tilt depends on the mean, and it on the direction
+        progress("ramps", 0.2 + 0.1 * done)
         down = _unit(normal - (normal * mean).sum(1, keepdims=True) * mean)
         total, many = np.zeros((2, count, 3)), np.zeros((2, count))
         for of, to, sign in ((i, j, 1.0), (j, i, -1.0)):

@@ -29,6 +29,7 @@ UNKNOWN = "unknown"
 BEST = 5  # hypotheses of a category that are refined to the end
 FREEDOM = 25.0  # of an ordinary category: what its pose and sizes cost in evidence
 AS_CUT = 0.2  # of the swing of parts, where nothing turned them
+UNEXPLAINED = 1.5  # what an observation that only others explain costs a category (log odds)
 HOPELESS = 40.0  # a category with this much more energy than the best is not refined with care
 COARSE = (((12.0, 9.0), 16), ((6.0, 6.0), BEST))  # cuts of the steps, in sigmas; hypotheses kept
 FINE = (5.0, 4.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0)
@@ -223,7 +224,12 @@ def _probabilities(
 ) -> dict[str, float]:
     names = [*fits, UNKNOWN]
     observations = 2.0 * evidence.total
-    logs = [fit.evidence for fit in fits.values()]
+    # fits are lenient with what they leave unexplained; where another category explains it, it is
+    # no error of the flattening
+    most = max(fit.explained for fit in fits.values())
+    logs = [
+        fit.evidence - UNEXPLAINED * observations * (most - fit.explained) for fit in fits.values()
+    ]
     logs.append(-FREEDOM - config.unknown_misfit * observations)
     value = np.exp(np.array(logs) - max(logs))
     return dict(zip(names, (value / value.sum()).tolist()))

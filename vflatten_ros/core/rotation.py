@@ -34,6 +34,7 @@ from vflatten_ros.core.sheets import Links, link_samples, outward, sheet_edges
 from vflatten_ros.core.sight import PlacedSight, goes_on
 from vflatten_ros.core.slide import neighbours, slide_m
 from vflatten_ros.core.slide import notice_of as slide_notice
+from vflatten_ros.core.slits import slits
 from vflatten_ros.core.unfolding import (
     carry,
     orientation,
@@ -67,6 +68,7 @@ MOST_JOINS = 3
 MOST_DOUBTFUL = 0.1  # of the samples, at a doubt of 1
 TOLD_M = 1e-4  # length of a link between samples that are said to be one point of the cloth
 TOLD_AMONG = 8  # samples nearest to such a point, of which the nearest that faces its way is it
+CUT_M = 0.008  # between points of one slit
 SLIT_M = 0.03  # widest slit of which one side tells what the other is
 RIM_LAID_M = 0.015  # between the two sides of a rim that lies flat as one
 CELL_M = 0.002  # of the image whose contour is the outline
@@ -191,11 +193,10 @@ def together(
     )
     row = np.concatenate([g.row for g in groups])
     firm = np.concatenate([g.firm for g in groups])
-    edge = edges_laid(surface, row, all_points.uv)[firm]
-    outline = outline_of(all_points.uv[firm], all_points.sigma_m[firm], edge, config)
+    side = np.concatenate(sides)
+    outline = _outline(surface, row, all_points, side, firm, config)
     notices = {notice.code: notice for g in groups for notice in g.notices}
     stress = float(np.sqrt((all_points.stress**2).mean()))
-    side = np.concatenate(sides)
     return Unfolded(
         surface,
         parts,
@@ -473,14 +474,14 @@ def unfolded_from(surface: Surface, part: Part, config: RotationConfig) -> Unfol
     # what is placed round rims alone has upper bounds only, and so lies too far out
     firm = (distances.around_sheet.sum(1) >= FIRM)[placed]
     firm |= firm.mean() < FIRM_SHARE  # too few would leave holes
-    edge = edges_laid(surface, np.flatnonzero(placed), points.uv)[firm]
-    outline = outline_of(points.uv[firm], points.sigma_m[firm], edge, config)
+    row, side = np.flatnonzero(placed), side[placed]
+    outline = _outline(surface, row, points, side, firm, config)
     return Unfolded(
         surface,
         (part,),
         points,
-        np.flatnonzero(placed),
-        side[placed],
+        row,
+        side,
         firm,
         outline,
         stress,
@@ -489,7 +490,23 @@ def unfolded_from(surface: Surface, part: Part, config: RotationConfig) -> Unfol
     )
 
 
-def outline_of(uv: Float, sigma_m: Float, edge: Int, config: RotationConfig) -> Outline:
+def _outline(
+    surface: Surface, row: Int, points: FlatPoints, side: Float, firm: Bool, config: RotationConfig
+) -> Outline:
+    """Outline of the samples `row`, which lie where the points are."""
+    edge = edges_laid(surface, row, points.uv)
+    laid = np.zeros(len(surface.edge), dtype=bool)
+    laid[row] = True
+    order = np.argsort(row)
+    links = surface.links.among(laid)
+    links = replace(links, a=order[links.a], b=order[links.b])
+    cuts = slits(points.uv, side, edge, links)
+    return outline_of(points.uv[firm], points.sigma_m[firm], edge[firm], config, cuts)
+
+
+def outline_of(
+    uv: Float, sigma_m: Float, edge: Int, config: RotationConfig, cuts: Float | None = None
+) -> Outline:
     """Where the density of the samples falls to a share of that of a single layer.
 
     A contour round every sample would go round the strays too, and be too large for it.
@@ -498,6 +515,8 @@ def outline_of(uv: Float, sigma_m: Float, edge: Int, config: RotationConfig) -> 
     ----------
     edge : ndarray of shape (n,)
         0: inside a sheet, 1: at an edge of the cloth, 2: where cloth goes on unseen.
+    cuts : ndarray of shape (m, 2), optional
+        Points along slits, which the outline follows.
     """
     low = uv.min(0) - 10 * config.edge_blur_m
     size = np.ceil((uv.max(0) + 10 * config.edge_blur_m - low) / CELL_M).astype(int)
@@ -511,6 +530,8 @@ def outline_of(uv: Float, sigma_m: Float, edge: Int, config: RotationConfig) -> 
     inside = (density > config.edge_density * single).astype(np.uint8)
     gap = round(config.close_m / CELL_M)
     inside = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, _disc(gap))
+    if cuts is not None and len(cuts):
+        inside = _cut(inside, (cuts - low) / CELL_M)
     inside = _without_spurs(inside, round(SPUR_M / CELL_M))
     contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -523,6 +544,22 @@ def outline_of(uv: Float, sigma_m: Float, edge: Int, config: RotationConfig) -> 
     inferred = _near(contour, uv[edge == 2]) > HIDDEN_SHARE * _near(contour, uv[edge > 0])
     inferred &= ~_before_an_end(contour, inferred)
     return Outline(contour, sigma_m[near], inferred)
+
+
+def _cut(inside: NDArray[np.uint8], cuts: Float) -> NDArray[np.uint8]:
+    """Without thin lines through points (col, row) near to one another or to the border."""
+    reach = CUT_M / CELL_M
+    border = cv2.dilate(inside, np.ones((3, 3), np.uint8)) & ~inside & 1
+    outside = np.argwhere(border)[:, ::-1]
+    away, nearest = cKDTree(outside).query(cuts, distance_upper_bound=reach)
+    i, j = cKDTree(cuts).query_pairs(reach, output_type="ndarray").T
+    starts = np.vstack([cuts[i], cuts[np.isfinite(away)]])
+    ends = np.vstack([cuts[j], outside[nearest[np.isfinite(away)]]])
+    drawn = np.zeros_like(inside)
+    for start, end in zip(np.rint(starts).astype(int), np.rint(ends).astype(int), strict=True):
+        cv2.line(drawn, start.tolist(), end.tolist(), (1,), 2)
+    rest: NDArray[np.uint8] = cv2.bitwise_and(inside, 1 - drawn)
+    return rest
 
 
 def _before_an_end(contour: Float, inferred: Bool) -> Bool:

@@ -1,0 +1,71 @@
+"""Slits between parts that lie side by side, told from sheets that hang together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.geometry import twice_area
+from vflatten_ros.core.rotation import outline_of
+from vflatten_ros.core.sheets import Links
+from vflatten_ros.core.slits import slits
+
+CONFIG = RotationConfig()
+STEP_M, SIDE_M, AT_M = CONFIG.spacing_m, 0.2, 0.101
+
+
+def cloth(slit_m, up=1.0, hole_m=0.0):
+    """Samples of a square, slit from its lower edge at u = AT_M; edges; pairs that are linked."""
+    uv = np.mgrid[0:SIDE_M:STEP_M, 0:SIDE_M:STEP_M].reshape(2, -1).T
+    uv = uv[np.linalg.norm(uv - [0.05, 0.15], axis=1) > hole_m]
+    a, b = cKDTree(uv).query_pairs(CONFIG.link_m, output_type="ndarray").T
+    low = (uv[a] + uv[b])[:, 1] / 2 < slit_m
+    across = ((uv[a] - AT_M) * (uv[b] - AT_M))[:, 0] < 0
+    far = np.linalg.norm(uv[a] - uv[b], axis=1) > 1.5 * hole_m if hole_m else np.zeros(len(a), bool)
+    kept = ~(across & low) & ~far
+    border = (uv < STEP_M / 2).any(1) | (uv > SIDE_M - 1.5 * STEP_M).any(1)
+    border |= (np.abs(uv[:, 0] - AT_M) < STEP_M) & (uv[:, 1] < slit_m)
+    border |= np.linalg.norm(uv - [0.05, 0.15], axis=1) < hole_m + STEP_M
+    return uv, np.full(len(uv), up), border.astype(int), a[kept], b[kept]
+
+
+def layers(*each):
+    """Several layers as one."""
+    first = np.cumsum([0, *(len(uv) for uv, *_ in each)])
+    uv, side, edge = (np.concatenate([layer[k] for layer in each]) for k in range(3))
+    a, b = (np.concatenate([x[k] + n for x, n in zip(each, first)]) for k in (3, 4))
+    length = np.linalg.norm(uv[a] - uv[b], axis=1)
+    links = Links(a, b, length, np.zeros(len(a), dtype=bool), np.zeros(len(a)))
+    return uv, side, edge, links
+
+
+def test_a_slit_is_found_along_its_whole_length_and_nowhere_else():
+    found = slits(*layers(cloth(0.12)))
+    assert len(found) > 30
+    assert np.abs(found[:, 0] - AT_M).max() < STEP_M
+    assert found[:, 1].min() < 0.01 and found[:, 1].max() == pytest.approx(0.12, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "whole", [{"slit_m": 0.0}, {"slit_m": 0.05}, {"slit_m": 0, "hole_m": 0.008}]
+)
+def test_a_sheet_a_notch_and_a_hole_are_none(whole):
+    assert len(slits(*layers(cloth(**whole)))) == 0
+
+
+def test_an_item_has_a_slit_where_all_of_its_layers_do():
+    assert len(slits(*layers(cloth(0.12), cloth(0.12, up=-1.0)))) > 60
+    assert len(slits(*layers(cloth(0.12), cloth(0.0, up=-1.0)))) == 0
+
+
+def test_the_outline_goes_in_and_out_of_a_slit():
+    uv, side, edge, links = layers(cloth(0.12), cloth(0.12, up=-1.0))
+    sigma = np.full(len(uv), 0.002)
+    shut = outline_of(uv, sigma, edge, CONFIG).uv
+    line = outline_of(uv, sigma, edge, CONFIG, slits(uv, side, edge, links)).uv
+    within = np.array([AT_M, 0.06])
+    assert np.linalg.norm(shut - within, axis=1).min() > 0.05
+    assert np.linalg.norm(line - within, axis=1).min() < 0.006
+    assert twice_area(line) > 0.94 * twice_area(shut)

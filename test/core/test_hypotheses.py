@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from vflatten_ros.core.hypotheses import Tried, settled
 
 
 def tried(
-    share=1.0, overlap=0.0, category="towel", misfit=-0.5, explained=1.0, aside=0.0, sure=1.0
+    share=1.0,
+    overlap=0.0,
+    category="towel",
+    misfit=-0.5,
+    explained=1.0,
+    aside=0.0,
+    sure=1.0,
+    unseen=0.0,
 ):
-    unfolded = SimpleNamespace(share=share, overlap=overlap)
+    outline = SimpleNamespace(inferred=np.arange(100) < 100 * unseen)
+    unfolded = SimpleNamespace(share=share, overlap=overlap, outline=outline)
     found = SimpleNamespace(
         category=category,
         probabilities={"towel": sure, "skirt": 1.0 - sure, "unknown": 0.0},
@@ -49,10 +58,11 @@ def test_a_way_that_fits_nothing_is_the_worst():
     assert nothing.badness == float("inf")
 
 
-def test_one_good_way_settles_it_unless_the_category_is_unsure():
+def test_one_good_way_settles_it_unless_the_category_or_much_of_the_outline_is_unsure():
     good, unsure, bad = tried(misfit=-0.5), tried(misfit=-0.5, sure=0.9), tried(misfit=0.5)
     assert settled([good], -0.15)
-    assert not settled([unsure], -0.15)
+    assert not settled([unsure], -0.15) and not settled([tried(unseen=0.2)], -0.15)
+    assert settled([tried(unseen=0.1)], -0.15)
     assert settled([bad, unsure], -0.15) and settled([unsure, good], -0.15)
     assert not settled([bad], -0.15) and not settled([bad, bad], -0.15)
     assert not settled([], -0.15)

@@ -44,6 +44,7 @@ WAYS = (  # how, greatest doubt, badness of what was tried before below which it
     (PUZZLE, 0.4, 0.05),
 )
 SURE = 0.97  # probability of a category below which one way alone is not believed
+MOST_UNSEEN = 0.15  # share of the outline that no view shows, above which it is not, either
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
@@ -112,10 +113,11 @@ def likeliest(
 
 
 def settled(tries: Sequence[Tried], enough: float) -> bool:
-    """Whether what was tried is good enough: below a badness, and sure or not by one way alone."""
+    """Whether what was tried is good enough: below a badness, and one way alone beyond doubt."""
     if not tries or _best(tries).badness >= enough:
         return False
-    return len(tries) > 1 or tries[0].sure >= SURE
+    unseen = float(tries[0].unfolded.outline.inferred.mean())
+    return len(tries) > 1 or (tries[0].sure >= SURE and unseen < MOST_UNSEEN)
 
 
 def _best(tries: Sequence[Tried]) -> Tried:

@@ -42,9 +42,9 @@ def layers(*each):
 
 
 def test_a_slit_is_found_along_its_whole_length_and_nowhere_else():
-    found = slits(*layers(cloth(0.12)))
+    (found,) = slits(*layers(cloth(0.12)))
     assert len(found) > 30
-    assert np.abs(found[:, 0] - AT_M).max() < STEP_M
+    assert np.abs(found[:, 0] - AT_M).max() < 2 * STEP_M
     assert found[:, 1].min() < 0.01 and found[:, 1].max() == pytest.approx(0.12, abs=0.02)
 
 
@@ -52,12 +52,13 @@ def test_a_slit_is_found_along_its_whole_length_and_nowhere_else():
     "whole", [{"slit_m": 0.0}, {"slit_m": 0.05}, {"slit_m": 0, "hole_m": 0.008}]
 )
 def test_a_sheet_a_notch_and_a_hole_are_none(whole):
-    assert len(slits(*layers(cloth(**whole)))) == 0
+    assert not slits(*layers(cloth(**whole)))
 
 
 def test_an_item_has_a_slit_where_all_of_its_layers_do():
-    assert len(slits(*layers(cloth(0.12), cloth(0.12, up=-1.0)))) > 60
-    assert len(slits(*layers(cloth(0.12), cloth(0.0, up=-1.0)))) == 0
+    (found,) = slits(*layers(cloth(0.12), cloth(0.12, up=-1.0)))
+    assert len(found) > 60
+    assert not slits(*layers(cloth(0.12), cloth(0.0, up=-1.0)))
 
 
 def test_the_outline_goes_in_and_out_of_a_slit():
@@ -69,3 +70,11 @@ def test_the_outline_goes_in_and_out_of_a_slit():
     assert np.linalg.norm(shut - within, axis=1).min() > 0.05
     assert np.linalg.norm(line - within, axis=1).min() < 0.006
     assert twice_area(line) > 0.94 * twice_area(shut)
+
+
+def test_the_outline_does_not_follow_what_runs_along_it():
+    uv, _, edge, _ = layers(cloth(0.0), cloth(0.0, up=-1.0))
+    sigma = np.full(len(uv), 0.002)
+    along = np.column_stack([np.full(40, 0.006), np.linspace(0.0, SIDE_M, 40)])
+    shut, line = (outline_of(uv, sigma, edge, CONFIG, cuts).uv for cuts in ((), (along,)))
+    assert np.array_equal(shut, line)

@@ -16,7 +16,14 @@ from vflatten_ros.core.hypotheses import likeliest
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.one_view import flatten_one_view
-from vflatten_ros.core.recognition import FREEDOM, UNKNOWN, Recognition, finish, recognise
+from vflatten_ros.core.recognition import (
+    FREEDOM,
+    UNKNOWN,
+    Recognition,
+    finish,
+    fit_again,
+    recognise,
+)
 from vflatten_ros.core.registration import ViewSurface, view_surface
 from vflatten_ros.core.rotation import Unfolded, fuse_views, turn_parts
 from vflatten_ros.core.template_fit import place
@@ -144,7 +151,7 @@ def _rotation(
         k = fit.template.vertices
         unfolded = turn_parts(unfolded, fit.points()[:k], rest[:k], config.rotation)
         progress("parts", (turn + 0.6) / TURNS)
-        found = _refitted(unfolded, found, tuple(templates), config)
+        found = _refitted(unfolded, found, config)
     none = np.zeros(0)
     notices = told + unfolded.notices
     if badness > DOUBTFUL:
@@ -220,15 +227,10 @@ def _described(
     return replace(garment, enough=enough(garment, config.views))
 
 
-def _refitted(
-    flattened: Unfolded, settled: Recognition, templates: tuple[Template, ...], config: Config
-) -> Recognition:
+def _refitted(flattened: Unfolded, settled: Recognition, config: Config) -> Recognition:
     """The settled category, fitted to the item as it lies now; legs together look like a skirt."""
-    only = tuple(t for t in templates if t.category == settled.category)
-    if not only:
-        return settled
-    fitted = recognise(flattened.outline, flattened.points, only, config.recognition)
-    fit = fitted.fits[settled.category]
+    before = settled.fits[settled.category]
+    fit = fit_again(before, flattened.outline, flattened.points, config.recognition)
     near = np.maximum(fit.edge_seen[:, 0], np.roll(fit.edge_seen[:, -1], 1))
     k = fit.template.vertices
     return replace(

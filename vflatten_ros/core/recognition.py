@@ -101,6 +101,22 @@ def recognise(
     )
 
 
+def fit_again(fit: Fit, outline: Outline, points: FlatPoints, config: RecognitionConfig) -> Fit:
+    """The same category, fitted from where it was, once its loose parts were turned to rest.
+
+    Raises
+    ------
+    InvalidInput
+        As recognise.
+    """
+    evidence = evidence_from(outline, points, config)
+    pose = np.stack([fit.pose, fit.pose])
+    state = np.stack([fit.state, fit.template.at_rest(fit.state)])
+    pose, state, energy = refine(fit.template, evidence, pose, state, FINE)
+    best = [int(energy.argmin())]
+    return finish(fit.template, evidence, pose[best], state[best])
+
+
 def fit_template(template: Template, evidence: Evidence, config: RecognitionConfig) -> Fit:
     """The best pose and cut of one category."""
     return fit_templates((template,), evidence, config)[template.category]

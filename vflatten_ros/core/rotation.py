@@ -69,6 +69,7 @@ MOST_DOUBTFUL = 0.1  # of the samples, at a doubt of 1
 TOLD_M = 1e-4  # length of a link between samples that are said to be one point of the cloth
 TOLD_AMONG = 8  # samples nearest to such a point, of which the nearest that faces its way is it
 CUT_M = 0.008  # between points of one slit
+DEEP_M = 0.020  # how deep within the outline a slit lies, by the middle of its points
 SLIT_M = 0.03  # widest slit of which one side tells what the other is
 RIM_LAID_M = 0.015  # between the two sides of a rim that lies flat as one
 CELL_M = 0.002  # of the image whose contour is the outline
@@ -505,7 +506,7 @@ def _outline(
 
 
 def outline_of(
-    uv: Float, sigma_m: Float, edge: Int, config: RotationConfig, cuts: Float | None = None
+    uv: Float, sigma_m: Float, edge: Int, config: RotationConfig, cuts: Sequence[Float] = ()
 ) -> Outline:
     """Where the density of the samples falls to a share of that of a single layer.
 
@@ -515,8 +516,8 @@ def outline_of(
     ----------
     edge : ndarray of shape (n,)
         0: inside a sheet, 1: at an edge of the cloth, 2: where cloth goes on unseen.
-    cuts : ndarray of shape (m, 2), optional
-        Points along slits, which the outline follows.
+    cuts : sequence of ndarray of shape (m, 2)
+        Points along slits, which the outline follows if they lead into the item.
     """
     low = uv.min(0) - 10 * config.edge_blur_m
     size = np.ceil((uv.max(0) + 10 * config.edge_blur_m - low) / CELL_M).astype(int)
@@ -530,8 +531,7 @@ def outline_of(
     inside = (density > config.edge_density * single).astype(np.uint8)
     gap = round(config.close_m / CELL_M)
     inside = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, _disc(gap))
-    if cuts is not None and len(cuts):
-        inside = _cut(inside, (cuts - low) / CELL_M)
+    inside = _cut(inside, [(cut - low) / CELL_M for cut in cuts])
     inside = _without_spurs(inside, round(SPUR_M / CELL_M))
     contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -546,15 +546,23 @@ def outline_of(
     return Outline(contour, sigma_m[near], inferred)
 
 
-def _cut(inside: NDArray[np.uint8], cuts: Float) -> NDArray[np.uint8]:
-    """Without thin lines through points (col, row) near to one another or to the border."""
-    reach = CUT_M / CELL_M
+def _cut(inside: NDArray[np.uint8], cuts: Sequence[Float]) -> NDArray[np.uint8]:
+    """Without thin lines through points (col, row) that lead into the item."""
+    depth = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_5) * CELL_M
+    into = []
+    for cut in cuts:
+        col, row = np.rint(cut).astype(int).clip(0, np.array(inside.shape[::-1]) - 1).T
+        if np.median(depth[row, col]) > DEEP_M:
+            into.append(cut)
+    if not into:
+        return inside
+    points, reach = np.vstack(into), CUT_M / CELL_M
     border = cv2.dilate(inside, np.ones((3, 3), np.uint8)) & ~inside & 1
     outside = np.argwhere(border)[:, ::-1]
-    away, nearest = cKDTree(outside).query(cuts, distance_upper_bound=reach)
-    i, j = cKDTree(cuts).query_pairs(reach, output_type="ndarray").T
-    starts = np.vstack([cuts[i], cuts[np.isfinite(away)]])
-    ends = np.vstack([cuts[j], outside[nearest[np.isfinite(away)]]])
+    away, nearest = cKDTree(outside).query(points, distance_upper_bound=reach)
+    i, j = cKDTree(points).query_pairs(reach, output_type="ndarray").T
+    starts = np.vstack([points[i], points[np.isfinite(away)]])
+    ends = np.vstack([points[j], outside[nearest[np.isfinite(away)]]])
     drawn = np.zeros_like(inside)
     for start, end in zip(np.rint(starts).astype(int), np.rint(ends).astype(int), strict=True):
         cv2.line(drawn, start.tolist(), end.tolist(), (1,), 2)

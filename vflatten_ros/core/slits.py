@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.values import Bool, Float, Int
 
-BESIDE_M = 0.008  # between the two sides of a slit
+BESIDE_M = 0.008  # between the two sides of a slit, most of which is closed
+WIDE_M = 0.016  # where it opens
 WAY = 6  # links from one side to the other, round a hole in what was seen
 LONG_M = 0.06  # shortest slit
 AWAY_M = 0.012  # from the middle of a slit, where another layer may go on across it
@@ -22,8 +23,8 @@ THIN_M = 0.0025  # standard deviation across a slit: straight, as what is torn b
 CROSSED = 0.5  # share of a slit that another layer crosses, for the item to have none there
 
 
-def slits(uv: Float, side: Float, edge: Int, links: Links) -> Float:
-    """Points along slits.
+def slits(uv: Float, side: Float, edge: Int, links: Links) -> list[Float]:
+    """Points along slits, and along edges that look like one: the sides of a rim, for one.
 
     Parameters
     ----------
@@ -38,15 +39,14 @@ def slits(uv: Float, side: Float, edge: Int, links: Links) -> Float:
 
     Returns
     -------
-    ndarray of shape (m, 2)
-        Midway between samples of the same side that lie side by side, at edges of sheets, without
-        a way from one to the other of a few links.
+    list of ndarray of shape (m, 2)
+        Of each, midway between samples of the same side that lie side by side, at edges of sheets,
+        without a way from one to the other of a few links.
     """
-    none = np.zeros((0, 2))
     ends = np.flatnonzero((edge > 0) & (side != 0))
     if not len(ends):
-        return none
-    i, j = ends[cKDTree(uv[ends]).query_pairs(BESIDE_M, output_type="ndarray")].T
+        return []
+    i, j = ends[cKDTree(uv[ends]).query_pairs(WIDE_M, output_type="ndarray")].T
     alike = side[i] == side[j]
     i, j = i[alike], j[alike]
     sheet = links.part(~links.rim)
@@ -54,22 +54,34 @@ def slits(uv: Float, side: Float, edge: Int, links: Links) -> Float:
         far = ~_joined_within(way, i, j, sheet, len(uv))
         i, j = i[far], j[far]
     if not len(i):
-        return none
+        return []
     middle = (uv[i] + uv[j]) / 2
-    near = cKDTree(middle).query_pairs(BESIDE_M, output_type="ndarray").T
-    ones = np.ones(near.shape[1], dtype=bool)
-    graph = csr_matrix((ones, (near[0], near[1])), shape=(len(i), len(i)))
-    label = connected_components(graph, directed=False)[1]
-    crossed = _crossed(uv, side, i, j, sheet)
-    kept = [none]
-    for k in range(label.max() + 1):
-        line = middle[label == k]
+    narrow = np.flatnonzero(np.linalg.norm(uv[i] - uv[j], axis=1) < BESIDE_M)
+    crossed = _crossed(uv, side, i[narrow], j[narrow], sheet)
+    label = _stretches(middle[narrow])
+    found = []
+    for k in range(label.max(initial=-1) + 1):
+        line = middle[narrow[label == k]]
         if np.ptp(line, axis=0).max() < LONG_M:
             continue
-        thickness = np.linalg.svd(line - line.mean(axis=0), compute_uv=False)[1]
+        centre = line.mean(axis=0)
+        thickness, along = (x[-1] for x in np.linalg.svd(line - centre, full_matrices=False)[1:])
         if thickness < THIN_M * np.sqrt(len(line)) and crossed[label == k].mean() < CROSSED:
-            kept.append(line)
-    return np.vstack(kept)
+            # where it opens, its sides are farther apart
+            straight = middle[np.abs((middle - centre) @ along) < AWAY_M / 2]
+            stretch = _stretches(straight)
+            own = stretch[cKDTree(straight).query(line)[1]]
+            found.append(straight[np.isin(stretch, own)])
+    return found
+
+
+def _stretches(points: Float) -> Int:
+    """Number of the stretch that each of (m, 2) points belongs to."""
+    i, j = cKDTree(points).query_pairs(BESIDE_M, output_type="ndarray").T
+    ones = np.ones(len(i), dtype=bool)
+    graph = csr_matrix((ones, (i, j)), shape=(len(points), len(points)))
+    label: Int = connected_components(graph, directed=False)[1]
+    return label
 
 
 def _joined_within(way: int, i: Int, j: Int, links: Links, count: int) -> Bool:

@@ -66,3 +66,9 @@ def test_one_good_way_settles_it_unless_the_category_or_much_of_the_outline_is_u
     assert settled([bad, unsure], -0.15) and settled([unsure, good], -0.15)
     assert not settled([bad], -0.15) and not settled([bad, bad], -0.15)
     assert not settled([], -0.15)
+
+
+def test_a_bad_way_and_a_near_tie_of_categories_are_not_to_be_trusted():
+    assert not tried().untrusted and not tried(sure=0.75).untrusted
+    assert "does not lie flat" in tried(overlap=0.2).untrusted
+    assert "60% likely" in tried(sure=0.6, misfit=-0.9).untrusted

@@ -579,7 +579,7 @@ class RotationConfig(Checked):
         0.004, "Least standard deviation of a flattened point, m.", low=1e-4, high=0.1
     )
     outline_sigma_m: float = option(
-        0.0035,
+        0.002,
         "Error that all of an outline shares, so that no length of it averages it out, m.",
         low=0.0,
         high=0.1,

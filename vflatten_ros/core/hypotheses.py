@@ -45,6 +45,8 @@ WAYS = (  # how, greatest doubt, badness of what was tried before below which it
 )
 SURE = 0.97  # probability of a category below which one way alone is not believed
 MOST_UNSEEN = 0.15  # share of the outline that no view shows, above which it is not, either
+DOUBTFUL = 0.3  # badness above which a result is not to be trusted
+UNSURE = 0.7  # probability of its category below which it is not, either
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
@@ -82,6 +84,15 @@ class Tried:
         """Probability of the likeliest category."""
         known = [p for name, p in self.found.probabilities.items() if name != UNKNOWN]
         return max(known, default=0.0)
+
+    @property
+    def untrusted(self) -> str:
+        """Why the result is not to be trusted; empty: it may be."""
+        if self.badness > DOUBTFUL:
+            return f"no category fits the item well, or it does not lie flat ({self.badness:.1f})"
+        if self.sure < UNSURE:
+            return f"it is only {self.sure:.0%} likely to be what it most looks like"
+        return ""
 
 
 def likeliest(

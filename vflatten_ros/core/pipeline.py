@@ -42,7 +42,6 @@ from vflatten_ros.core.values import (
 )
 
 MOST_JUDGED = 3  # corresponding points given, up to which others are found to judge them
-DOUBTFUL = 0.3  # badness above which the result is not to be trusted
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
 
 
@@ -143,7 +142,7 @@ def _rotation(
     given, told = fused.given, fused.notices + fused.given.notices
     best = likeliest(fused, tuple(templates), config, progress)
     del fused  # its points are many
-    unfolded, found, badness = best.unfolded, best.found, best.badness
+    unfolded, found = best.unfolded, best.found
     for turn in range(TURNS if found.category != UNKNOWN else 0):
         progress("parts", turn / TURNS)
         fit = found.fits[found.category]
@@ -154,9 +153,8 @@ def _rotation(
         found = _refitted(unfolded, found, config)
     none = np.zeros(0)
     notices = told + unfolded.notices
-    if badness > DOUBTFUL:
-        text = f"no category fits the item well, or it does not lie flat ({badness:.1f})"
-        notices = (*notices, Notice("untrusted", text))
+    if best.untrusted:
+        notices = (*notices, Notice("untrusted", best.untrusted))
     flattened = Flattened(
         points=unfolded.points,
         start_uv=None,

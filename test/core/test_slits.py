@@ -78,3 +78,12 @@ def test_the_outline_does_not_follow_what_runs_along_it():
     along = np.column_stack([np.full(40, 0.006), np.linspace(0.0, SIDE_M, 40)])
     shut, line = (outline_of(uv, sigma, edge, CONFIG, cuts).uv for cuts in ((), (along,)))
     assert np.array_equal(shut, line)
+
+
+def test_a_slit_may_go_on_among_strays_beyond_the_outline():
+    uv, side, edge, links = layers(cloth(0.12), cloth(0.12, up=-1.0))
+    sigma = np.full(len(uv), 0.002)
+    (found,) = slits(uv, side, edge, links)
+    longer = np.vstack([found, found - [0.0, 0.11]])
+    line, same = (outline_of(uv, sigma, edge, CONFIG, (cut,)).uv for cut in (found, longer))
+    assert abs(twice_area(line) / twice_area(same) - 1) < 0.02

@@ -551,21 +551,21 @@ def _cut(inside: NDArray[np.uint8], cuts: Sequence[Float]) -> NDArray[np.uint8]:
     depth = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_5) * CELL_M
     into = []
     for cut in cuts:
-        col, row = np.rint(cut).astype(int).clip(0, np.array(inside.shape[::-1]) - 1).T
-        if np.median(depth[row, col]) > DEEP_M:
-            into.append(cut)
+        cell = np.rint(cut).astype(int).clip(0, np.array(inside.shape[::-1]) - 1)
+        if np.median(depth[cell[:, 1], cell[:, 0]]) > DEEP_M:
+            into.append(cell)
     if not into:
         return inside
-    points, reach = np.vstack(into), CUT_M / CELL_M
+    points, reach = np.vstack(into), round(CUT_M / CELL_M)
+    drawn = np.zeros_like(inside)
+    drawn[points[:, 1], points[:, 0]] = 1
     border = cv2.dilate(inside, np.ones((3, 3), np.uint8)) & ~inside & 1
     outside = np.argwhere(border)[:, ::-1]
     away, nearest = cKDTree(outside).query(points, distance_upper_bound=reach)
-    i, j = cKDTree(points).query_pairs(reach, output_type="ndarray").T
-    starts = np.vstack([points[i], points[np.isfinite(away)]])
-    ends = np.vstack([points[j], outside[nearest[np.isfinite(away)]]])
-    drawn = np.zeros_like(inside)
-    for start, end in zip(np.rint(starts).astype(int), np.rint(ends).astype(int), strict=True):
-        cv2.line(drawn, start.tolist(), end.tolist(), (1,), 2)
+    for start, end in zip(points[np.isfinite(away)], outside[nearest[np.isfinite(away)]]):
+        cv2.line(drawn, start.tolist(), end.tolist(), (1,))
+    drawn = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, _disc(reach // 2))
+    drawn = cv2.dilate(drawn, np.ones((2, 2), np.uint8))
     rest: NDArray[np.uint8] = cv2.bitwise_and(inside, 1 - drawn)
     return rest
 

@@ -65,10 +65,10 @@ def slits(uv: Float, side: Float, edge: Int, links: Links) -> list[Float]:
         if np.ptp(line, axis=0).max() < LONG_M:
             continue
         centre = line.mean(axis=0)
-        thickness, along = (x[-1] for x in np.linalg.svd(line - centre, full_matrices=False)[1:])
+        thickness, across = (x[-1] for x in np.linalg.svd(line - centre, full_matrices=False)[1:])
         if thickness < THIN_M * np.sqrt(len(line)) and crossed[label == k].mean() < CROSSED:
             # where it opens, its sides are farther apart
-            straight = middle[np.abs((middle - centre) @ along) < AWAY_M / 2]
+            straight = middle[np.abs((middle - centre) @ across) < AWAY_M / 2]
             stretch = _stretches(straight)
             own = stretch[cKDTree(straight).query(line)[1]]
             found.append(straight[np.isin(stretch, own)])

@@ -18,6 +18,7 @@ BESIDE_M = 0.008  # between the two sides of a slit, most of which is closed
 WIDE_M = 0.016  # where it opens
 WAY = 6  # links from one side to the other, round a hole in what was seen
 LONG_M = 0.06  # shortest slit
+STEP_M = 0.004  # along a slit, for each of the points that tell of it
 AWAY_M = 0.012  # from the middle of a slit, where another layer may go on across it
 THIN_M = 0.0025  # standard deviation across a slit: straight, as what is torn by noise is not
 CROSSED = 0.5  # share of a slit that another layer crosses, for the item to have none there
@@ -44,35 +45,50 @@ def slits(uv: Float, side: Float, edge: Int, links: Links) -> list[Float]:
         without a way from one to the other of a few links.
     """
     ends = np.flatnonzero((edge > 0) & (side != 0))
-    if not len(ends):
-        return []
-    i, j = ends[cKDTree(uv[ends]).query_pairs(WIDE_M, output_type="ndarray")].T
-    alike = side[i] == side[j]
-    i, j = i[alike], j[alike]
-    sheet = links.part(~links.rim)
-    for way in (2, WAY):  # most of them are neighbours
-        far = ~_joined_within(way, i, j, sheet, len(uv))
-        i, j = i[far], j[far]
-    if not len(i):
-        return []
+    linked = _linked(links.part(~links.rim), len(uv))
+    i, j = _torn(uv, side, ends, BESIDE_M, linked)
     middle = (uv[i] + uv[j]) / 2
-    narrow = np.flatnonzero(np.linalg.norm(uv[i] - uv[j], axis=1) < BESIDE_M)
-    crossed = _crossed(uv, side, i[narrow], j[narrow], sheet)
-    label = _stretches(middle[narrow])
+    label = _stretches(middle)
+    long = np.bincount(label) * STEP_M > LONG_M  # fewer points than that cannot be
     found = []
-    for k in range(label.max(initial=-1) + 1):
-        line = middle[narrow[label == k]]
+    for k in np.flatnonzero(long):
+        own = label == k
+        line = middle[own]
         if np.ptp(line, axis=0).max() < LONG_M:
             continue
         centre = line.mean(axis=0)
         thickness, across = (x[-1] for x in np.linalg.svd(line - centre, full_matrices=False)[1:])
-        if thickness < THIN_M * np.sqrt(len(line)) and crossed[label == k].mean() < CROSSED:
-            # where it opens, its sides are farther apart
-            straight = middle[np.abs((middle - centre) @ across) < AWAY_M / 2]
-            stretch = _stretches(straight)
-            own = stretch[cKDTree(straight).query(line)[1]]
-            found.append(straight[np.isin(stretch, own)])
+        if thickness > THIN_M * np.sqrt(len(line)):
+            continue
+        if _crossed(uv, side, i[own], j[own], linked).mean() < CROSSED:
+            found.append(_widened(line, centre, across, uv, side, ends, linked))
     return found
+
+
+def _widened(
+    line: Float, centre: Float, across: Float, uv: Float, side: Float, ends: Int, linked: csr_matrix
+) -> Float:
+    """A slit with what it goes on to where its sides are farther apart."""
+    straight = ends[np.abs((uv[ends] - centre) @ across) < WIDE_M]
+    i, j = _torn(uv, side, straight, WIDE_M, linked)
+    middle = (uv[i] + uv[j]) / 2
+    middle = middle[np.abs((middle - centre) @ across) < AWAY_M / 2]
+    stretch = _stretches(middle)
+    wide: Float = middle[np.isin(stretch, stretch[cKDTree(middle).query(line)[1]])]
+    return wide
+
+
+def _torn(uv: Float, side: Float, ends: Int, most_m: float, linked: csr_matrix) -> tuple[Int, Int]:
+    """Pairs of some samples of one side that lie side by side and do not hang together."""
+    if not len(ends):
+        return ends, ends
+    i, j = ends[cKDTree(uv[ends]).query_pairs(most_m, output_type="ndarray")].T
+    alike = side[i] == side[j]
+    i, j = i[alike], j[alike]
+    for way in (2, WAY):  # most of them are neighbours
+        far = ~_joined_within(way, i, j, linked)
+        i, j = i[far], j[far]
+    return i, j
 
 
 def _stretches(points: Float) -> Int:
@@ -84,13 +100,17 @@ def _stretches(points: Float) -> Int:
     return label
 
 
-def _joined_within(way: int, i: Int, j: Int, links: Links, count: int) -> Bool:
+def _linked(links: Links, count: int) -> csr_matrix:
+    both = (np.r_[links.a, links.b], np.r_[links.b, links.a])
+    ones = np.ones(2 * len(links.a), dtype=np.float32)
+    return csr_matrix((ones, both), shape=(count, count))
+
+
+def _joined_within(way: int, i: Int, j: Int, linked: csr_matrix) -> Bool:
     """Whether (m,) pairs of samples hang together by a few links."""
     if not len(i):
         return np.zeros(0, dtype=bool)
     start, which = np.unique(i, return_inverse=True)
-    both = (np.r_[links.a, links.b], np.r_[links.b, links.a])
-    linked = csr_matrix((np.ones(2 * len(links.a), dtype=np.float32), both), shape=(count, count))
     reached = linked[start]
     for _ in range(way - 1):
         reached = reached @ linked
@@ -99,7 +119,7 @@ def _joined_within(way: int, i: Int, j: Int, links: Links, count: int) -> Bool:
     return joined
 
 
-def _crossed(uv: Float, side: Float, i: Int, j: Int, sheet: Links) -> Bool:
+def _crossed(uv: Float, side: Float, i: Int, j: Int, linked: csr_matrix) -> Bool:
     """Whether cloth of the other side runs across between (m,) pairs."""
     middle, over = (uv[i] + uv[j]) / 2, uv[j] - uv[i]
     over *= AWAY_M / np.maximum(np.linalg.norm(over, axis=1, keepdims=True), 1e-9)
@@ -115,5 +135,5 @@ def _crossed(uv: Float, side: Float, i: Int, j: Int, sheet: Links) -> Bool:
         )
         both = (one < len(theirs)) & (other < len(theirs))
         ends = theirs[one[both]], theirs[other[both]]
-        crossed[mine[both]] = _joined_within(WAY, *ends, sheet, len(uv))
+        crossed[mine[both]] = _joined_within(WAY, *ends, linked)
     return crossed

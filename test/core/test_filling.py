@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flat import lying_at
 
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import RecognitionConfig
 from vflatten_ros.core.filling import filled
 from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.recognition import recognise
-from vflatten_ros.core.values import FlatPoints, Outline
+from vflatten_ros.core.values import Outline
 
 WIDTH_M, LENGTH_M, NOTCH_M, STEP_M = 0.34, 0.60, 0.10, 0.004
 TOWEL = tuple(t for t in load_templates() if t.category == "towel")
@@ -39,17 +40,7 @@ def notched(inferred_sides=NOTCH, step=1):
         x.ravel() for x in np.meshgrid(np.arange(0.005, 0.34, 0.01), np.arange(0.005, 0.6, 0.01))
     )
     inside = (u < WIDTH_M - NOTCH_M) | (v < LENGTH_M - NOTCH_M)
-    points = np.column_stack([u, v])[inside]
-    n = len(points)
-    cloth = FlatPoints(
-        uv=points,
-        xyz_hanger=np.column_stack([points, np.zeros(n)]),
-        view_id=np.zeros(n, dtype=np.int64),
-        pixel=np.zeros((n, 2), dtype=np.int64),
-        sigma_m=np.full(n, 0.002),
-        stress=np.zeros(n),
-        inferred=np.zeros(n, dtype=bool),
-    )
+    cloth = lying_at(np.column_stack([u, v])[inside])
     return Outline(uv, np.full(len(uv), 0.002), flags), cloth
 
 

@@ -7,6 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
+from flat import lying_at
 
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import MeasurementConfig, RecognitionConfig
@@ -36,16 +37,7 @@ def cloth(views: int, length_m=LENGTH_M, strip_m=0.0, strip_width_m=0.0) -> Flat
     u, v = np.meshgrid(np.arange(0.005, WIDTH_M, 0.01), np.arange(0.005, length_m + strip_m, 0.01))
     uv = np.column_stack([u.ravel(), v.ravel()])
     uv = uv[(uv[:, 1] < length_m) | (uv[:, 0] > WIDTH_M - strip_width_m)]
-    n = len(uv)
-    return FlatPoints(
-        uv=uv,
-        xyz_hanger=np.column_stack([uv, np.zeros(n)]),
-        view_id=np.arange(n) % views,
-        pixel=np.zeros((n, 2), dtype=np.int64),
-        sigma_m=np.full(n, 0.002),
-        stress=np.zeros(n),
-        inferred=np.zeros(n, dtype=bool),
-    )
+    return lying_at(uv, views=views)
 
 
 def measured(*, top_seen=True, views=2, **settings):

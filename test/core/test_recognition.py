@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from flat import lying_at
 
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import RecognitionConfig
-from vflatten_ros.core.recognition import recognise
-from vflatten_ros.core.values import FlatPoints, Outline
+from vflatten_ros.core.recognition import fit_again, recognise
+from vflatten_ros.core.values import Outline
 
 STEP_M = 0.004
 TEMPLATES = load_templates()
@@ -25,20 +26,16 @@ def along(corners):
     )
 
 
-def found(corners):
+def drawn(corners):
+    """A seen outline, and points on it."""
     line = along(np.array(corners))
     n = len(line)
-    points = FlatPoints(
-        uv=line,
-        xyz_hanger=np.column_stack([line, np.zeros(n)]),
-        view_id=np.zeros(n, dtype=np.int64),
-        pixel=np.zeros((n, 2), dtype=np.int64),
-        sigma_m=np.full(n, 0.004),
-        stress=np.zeros(n),
-        inferred=np.zeros(n, dtype=bool),
-    )
     outline = Outline(line, np.full(n, 0.004), np.zeros(n, dtype=bool))
-    return recognise(outline, points, TEMPLATES, RecognitionConfig())
+    return outline, lying_at(line, 0.004)
+
+
+def found(corners):
+    return recognise(*drawn(corners), TEMPLATES, RecognitionConfig())
 
 
 def test_a_wide_notch_between_straight_legs_is_no_error_of_a_skirt():
@@ -54,3 +51,16 @@ def test_a_wide_notch_between_straight_legs_is_no_error_of_a_skirt():
     ]
     assert found(skirt).category == "skirt"
     assert found(shorts).category == "shorts"
+
+
+def test_a_fit_goes_on_from_where_it_was_when_its_notch_has_closed():
+    """The waist, which is narrower in most shorts, is the wider end here."""
+    shorts = [[0, 0], [0.14, 0], [0.17, 0.14], [0.2, 0], [0.34, 0], [0.36, 0.38], [-0.02, 0.38]]
+    closed = [shorts[k] for k in (0, 4, 5, 6)]
+    before = found(shorts).fits["shorts"]
+    again = fit_again(before, *drawn(closed), RecognitionConfig())
+    crotch, waist = (again.template.landmarks[name] for name in ("crotch", "waist_front"))
+    up = again.points()[waist] - again.points()[crotch]
+    assert up[1] > 0.1  # as it was; alone it would be fitted the other way round
+    anew = recognise(*drawn(closed), TEMPLATES, RecognitionConfig()).fits["shorts"]
+    assert (anew.points()[waist] - anew.points()[crotch])[1] < 0

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from vflatten_ros.core.distances import pieces
 from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.values import Bool, Float, Int
 
@@ -94,10 +94,7 @@ def _torn(uv: Float, side: Float, ends: Int, most_m: float, linked: csr_matrix) 
 def _stretches(points: Float) -> Int:
     """Number of the stretch that each of (m, 2) points belongs to."""
     i, j = cKDTree(points).query_pairs(BESIDE_M, output_type="ndarray").T
-    ones = np.ones(len(i), dtype=bool)
-    graph = csr_matrix((ones, (i, j)), shape=(len(points), len(points)))
-    label: Int = connected_components(graph, directed=False)[1]
-    return label
+    return pieces(i, j, np.ones(len(points), dtype=bool))
 
 
 def _linked(links: Links, count: int) -> csr_matrix:

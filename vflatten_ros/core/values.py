@@ -254,7 +254,7 @@ class Landmark:
     name: str
     uv: tuple[float, float]  # flat frame
     uv_sigma_m: float
-    xyz_hanger: tuple[float, float, float] | None  # unseen: the cloth nearest to it that was seen
+    xyz_hanger: tuple[float, float, float] | None  # unseen: the nearest cloth seen; None: none was
     xyz_sigma_m: float
     views: tuple[int, ...]  # view_ids that show it, best first; none: unseen
     certainty: float  # 0-1

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 
 import numpy as np
 
@@ -22,11 +22,11 @@ from vflatten_ros.core.grouping import (
     put_beside,
     unfold_group,
 )
-from vflatten_ros.core.parallel import beside
 from vflatten_ros.core.placing import Group, place_groups
 from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
 from vflatten_ros.core.rotation import (
     Fused,
+    Surface,
     Unfolded,
     doubts,
     link_surface,
@@ -145,11 +145,15 @@ class _Ways:
         config: Config,
         progress: Progress,
     ) -> None:
+        self._fused = fused
         self._templates, self._config, self._progress = templates, config, progress
         self._grouped: dict[float, Grouped] = {}
-        with beside(partial(doubts, fused, config.rotation)) as doubt:
-            self._linked = link_surface(fused, config.rotation, progress)
-        self._doubted = replace(self._linked, doubt=doubt.result())
+        self._linked = link_surface(fused, config.rotation, progress)
+
+    @cached_property
+    def _doubted(self) -> Surface:
+        doubt = doubts(self._fused, self._config.rotation, self._progress)
+        return replace(self._linked, doubt=doubt)
 
     def tried(self, how: str, doubt: float) -> Tried:
         """One of WAYS.

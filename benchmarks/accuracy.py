@@ -51,6 +51,7 @@ RUNS = {
     "chosen": "The paper's method, views and points chosen by itself (`method: kita2019`)",
     "calibration": "All views, the calibrated axis 3 mm and 0.5 degrees off",
 }
+USUAL_M = 1.4  # from the rig to the wrist's axis, at most
 FAILED_SIZE_PCT = 7.0  # a size further off than this is drawn
 
 HEAD = """# Accuracy
@@ -59,10 +60,11 @@ Written by `make accuracy`; do not edit.
 
 Recordings of simulated garments (bags/README.md says how), compared with what the simulation knows.
 Real items will do worse in ways that only real recordings can show. Sizes are signed errors in per
-cent, with how many stated standard deviations they are. A recording has 24 views taken at rest,
-1 mm of noise and no wall unless it says otherwise. Points and landmarks: median distance to
-the truth. Overlap: intersection over union with the true outline. Seconds: opening, reading and
-all stages on the machine that wrote this page.
+cent, with how many stated standard deviations they are. A recording has 24 views taken at rest
+from 1.3 m away, 1 mm of noise at that distance and no wall unless it says otherwise; those named
+`sway` swing by 8 mm and lag by 1.5 degrees in place of 3 and 0.5. Points and landmarks: median
+distance to the truth. Overlap: intersection over union with the true outline. Seconds: opening,
+reading and all stages on the machine that wrote this page.
 """
 
 
@@ -205,12 +207,15 @@ def judged(
 
 
 def recorded(truth: Mapping[str, Any]) -> str:
-    """Size, and what differs from 24 views at rest, 1 mm of noise and no wall."""
+    """Size, and what differs from 24 views at rest, 1.3 m away, 1 mm of noise and no wall."""
     parts = [f"{100 * truth['W']:.0f} x {100 * truth['L']:.0f} cm"]
     if len(truth["views"]) != 24:
         parts.append(f"{len(truth['views'])} views")
     if truth["noise"] != 1.0:
         parts.append(f"noise {truth['noise']:g} mm")
+    away_m = truth["wrist_to_optical"]["t"][2]
+    if away_m > USUAL_M:
+        parts.append(f"{away_m:.1f} m away")
     parts += ["wall"] * bool(truth["wall"]) + ["turning"] * bool(truth["continuous"])
     return ", ".join(parts)
 

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from recordings import BAGS
 
+from vflatten_ros.bag import gather_views, open_recording
+from vflatten_ros.categories import load_templates
 from vflatten_ros.core import hypotheses, parallel, pipeline
 from vflatten_ros.core.config import Config
+from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.replay import replay_recording
 from vflatten_ros.results import garment_result, json_text
 
@@ -74,6 +77,25 @@ def test_layers_that_lie_flush_spoil_the_skirt_unless_they_are_looked_for(monkey
     monkeypatch.setattr(hypotheses, "WAYS", hypotheses.WAYS[:1])
     garment = replay_recording(BAGS / "SK2_1", ALL_VIEWS).garment
     assert max(errors(garment, BAGS / "SK2_1")[1]) > 0.04  # 0.016 with all ways
+
+
+@pytest.mark.slow
+def test_three_times_the_noise_is_seen_to():
+    rig = load_calibration(calibration_beside(BAGS / "SH1_1"))
+    views = gather_views(open_recording(BAGS / "SH1_1"), rig, ALL_VIEWS).views()
+    rng = np.random.default_rng(11)
+    noisy = [
+        dataclasses.replace(view, points_rig=view.points_rig * (1.0 + rng.normal(0, 0.002, (n, 1))))
+        for view in views
+        if (n := len(view.points_rig))
+    ]
+    garment = pipeline.flatten_garment(noisy, (), load_templates(), ALL_VIEWS)
+    category, wrong = errors(garment, BAGS / "SH1_1")
+    assert garment.category == category
+    assert max(wrong) < 0.07  # not with rotation.widen false
+    assert "coarse_points" in {notice.code for notice in garment.notices}
+    assert point_error_m(garment, BAGS / "SH1_1") < 0.01
+    assert not untrusted(garment)
 
 
 @pytest.mark.slow

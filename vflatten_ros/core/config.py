@@ -508,7 +508,19 @@ class MeasurementConfig(Checked):
 class RotationConfig(Checked):
     """The automatic method: one surface model from all views."""
 
-    noise_m: float = option(0.001, "Depth noise of one point, m.", low=1e-5, high=0.02)
+    noise_m: float = option(
+        0.001, "Depth noise of one point that the lengths below are for, m.", low=1e-5, high=0.02
+    )
+    pitch_m: float = option(
+        0.0026,
+        "Distance of neighbouring points that the lengths below are for, m.",
+        low=1e-4,
+        high=0.05,
+    )
+    widen: bool = option(
+        True,
+        "Widen the lengths of fits, samples and links where points are noisier or farther apart.",
+    )
     view_fit_m: float = option(
         0.012, "Radius of the local planes of a single view, m.", low=0.002, high=0.1
     )

@@ -17,9 +17,9 @@ from vflatten_ros.core.geometry import tangents
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
-NEIGHBOURS = 64  # points used for one fit
+NEIGHBOURS, RADIUS_M, LEAST = 64, 0.007, 12  # most points for a fit of this radius, never fewer
 CHUNK = 1024  # samples fitted at a time: they stay in the cache
-BANDS_M = (0.003, 0.002, 0.0015)  # height (Gaussian) of the successive fits
+BANDS = (3.0, 2.0, 1.5)  # height (Gaussian) of the successive fits, in standard deviations
 MIN_CELL = 3  # points that make a sample
 
 
@@ -98,22 +98,24 @@ def _fit(
 ) -> tuple[Float, Float, Float, Int, Bool]:
     """Move samples onto their own layer by local fits: planes first, a quadric last."""
     radius, start = config.fit_m, at
-    distance, near = tree.query(at, k=NEIGHBOURS, distance_upper_bound=radius * 1.2)
+    most = max(LEAST, round(NEIGHBOURS * (radius / RADIUS_M) ** 2))
+    distance, near = tree.query(at, k=most, distance_upper_bound=radius * 1.2)
     found = np.isfinite(distance)
     near = np.where(found, near, 0)
     # a nanometre in a centimetre is enough: half the memory to go through
     around = (points[near] - start[:, None]).astype(np.float32)
     their_normals = normals[near].astype(np.float32)
-    for band in BANDS_M:
+    for band in BANDS:
         e1, e2 = tangents(normal)
         frame = np.stack([e1, e2, normal], axis=-1).astype(np.float32)
         alike = np.matmul(their_normals, frame[..., 2:])[..., 0] > 0.5
         local = np.matmul(around - (at - start)[:, None].astype(np.float32), frame)
         x, y, height = local[..., 0] / radius, local[..., 1] / radius, local[..., 2]
-        weight = (1 - (x * x + y * y).clip(0, 1)) ** 2 * np.exp(-0.5 * (height / band) ** 2)
+        off = height / (band * config.noise_m)
+        weight = (1 - (x * x + y * y).clip(0, 1)) ** 2 * np.exp(-0.5 * off**2)
         weight = np.where(found & alike, weight, np.float32(0.0))
         basis = [np.ones_like(x), x, y]
-        if band == BANDS_M[-1]:
+        if band == BANDS[-1]:
             basis += [x * x, x * y, y * y]
         design = np.stack(basis, axis=1)  # (n, terms, k)
         weighted = design * weight[:, None]

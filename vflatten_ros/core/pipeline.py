@@ -12,6 +12,7 @@ from vflatten_ros.core.automatic_pair import fill_up, flatten_best_pair
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.filling import filled
+from vflatten_ros.core.grain import suited
 from vflatten_ros.core.hypotheses import likeliest
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.model_images import model_image_scores
@@ -139,6 +140,7 @@ def _rotation(
         config.integration,
         config.correspondences,
     )
+    config = replace(config, rotation=suited(config.rotation, fused.grain))
     given, told = fused.given, fused.notices + fused.given.notices
     best = likeliest(fused, tuple(templates), config, progress)
     del fused  # its points are many

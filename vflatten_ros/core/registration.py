@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.geometry import Float, inverse, rigid, rotation_about, transform_points
+from vflatten_ros.core.grain import Grain, grain_of, suited
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.sight import Sight, sight_of
 from vflatten_ros.core.values import Int, Progress, View, no_progress
@@ -26,6 +27,7 @@ from vflatten_ros.core.values import Int, Progress, View, no_progress
 MIN_POINTS = 100  # a view with fewer item points shows nothing that could be placed
 PAIR_POINTS = 300.0  # noise is alike in neighbouring pixels: more pairs than this say no more
 MOST_PARTNERS = 4  # on either side of a view
+NEIGHBOURS, RADIUS_M, LEAST = 24, 0.012, 8  # most points of a plane of this radius, and fewest
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,7 @@ class ViewSurface:
     index: Int  # (n,) row of the view's points
     camera: Float  # (3,) hanger frame
     tree: cKDTree  # of smooth
+    grain: Grain
     sight: Sight | None = None  # in the hanger frame; None if the cloud is not that of a camera
 
 
@@ -61,9 +64,10 @@ def view_surface(view: View, config: RotationConfig) -> ViewSurface:
             "leave the view out or widen segmentation.radius_m"
         )
     camera = T_hanger_rig[:3, 3]
-    smooth, normals, count = _planes(points, config.view_fit_m)
+    grain = grain_of(points)
+    smooth, normals, count = _planes(points, suited(config, grain).view_fit_m)
     normals = normals * np.where(((camera - points) * normals).sum(1) < 0, -1.0, 1.0)[:, None]
-    good = count >= 8
+    good = count >= LEAST
     return ViewSurface(
         view.view_id,
         view.angle_rad,
@@ -73,13 +77,15 @@ def view_surface(view: View, config: RotationConfig) -> ViewSurface:
         np.flatnonzero(good),
         camera,
         cKDTree(smooth[good]),
+        grain,
         sight_of(points, view.pixel, view.shape),
     )
 
 
-def _planes(points: Float, radius_m: float, neighbours: int = 24) -> tuple[Float, Float, Int]:
+def _planes(points: Float, radius_m: float) -> tuple[Float, Float, Int]:
     """Plane through the neighbours of each point: nearest point on it, normal, neighbours used."""
-    distance, near = cKDTree(points).query(points, k=neighbours, distance_upper_bound=radius_m)
+    most = max(LEAST, round(NEIGHBOURS * (radius_m / RADIUS_M) ** 2))
+    distance, near = cKDTree(points).query(points, k=most, distance_upper_bound=radius_m)
     found = np.isfinite(distance)
     weight = np.where(found, (1 - (distance / radius_m).clip(0, 1) ** 2) ** 2, 0.0)
     offset = points[np.where(found, near, 0)] - points[:, None]

@@ -25,6 +25,7 @@ from vflatten_ros.core.geometry import (
     transform_points,
     twice_area,
 )
+from vflatten_ros.core.grain import Grain, notices_of, suited, typical
 from vflatten_ros.core.joining import agreeing, find_ties, largest_pieces, near_paths
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.puzzle import overlap as lying_on
@@ -84,6 +85,7 @@ class Fused:
     normals: Float  # (m, 3)
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
+    grain: Grain  # of the points, in most views
     sights: tuple[PlacedSight, ...] = ()  # none: whether cloth goes on is told by the samples
     given: Judged = NOTHING_GIVEN  # corresponding points
     notices: tuple[Notice, ...] = ()
@@ -332,6 +334,9 @@ def fuse_views(
     for each in mapped(surface, views):
         surfaces.append(each)
         progress("surface", len(surfaces) / len(views))
+    grain = typical([surface.grain for surface in surfaces])
+    notices = notices_of(config, grain)
+    config = suited(config, grain)
     poses = register_views(surfaces, config, progress)
     looked = []
     if prints is not None and prints.features:
@@ -361,14 +366,15 @@ def fuse_views(
         progress("fuse", 0.9)
         slid = slide_m([(placed[i], placed[j]) for i, j in looked], prints)
     doubted = prints is not None and slid is not None and slid > prints.slide_m
-    notices = (slide_notice(slid),) if slid is not None and doubted else ()
+    if slid is not None and doubted:
+        notices = (*notices, slide_notice(slid))
     checked = judged(given, placed, limits or IntegrationConfig())
     sights = tuple(
         PlacedSight(surface.sight, pose)
         for surface, pose in zip(surfaces, poses, strict=True)
         if surface.sight is not None
     )
-    return Fused(samples, points, normals, ids[of_view], pixel, sights, checked, notices)
+    return Fused(samples, points, normals, ids[of_view], pixel, grain, sights, checked, notices)
 
 
 def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Surface:

@@ -282,6 +282,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "ends_alike": "turned by half a turn the item looks the same: its ends' names may be exchanged",
     "solution_uncertain": "the item may lie otherwise, with another width or length",
     "correspondence_rejected": "a corresponding point contradicts the others",
+    "coarse_points": "the points are noisier, or farther apart, than the method is set for",
     "views_misplaced": "a print on the cloth contradicts the registration of the views",
     "views_chosen": "which views the two-view method chose by itself",
     "high_stress": "the distances contradict each other more than noise explains",

@@ -1,0 +1,74 @@
+"""Noise and pitch of known points, and what is widened for them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.grain import Grain, grain_of, notices_of, suited, typical
+
+
+def curved(pitch_m, noise_m, radius_m=0.05):
+    """Half a cylinder, seen from above on an even grid."""
+    x, y = np.mgrid[-0.04:0.04:pitch_m, 0:0.3:pitch_m]
+    z = np.sqrt(radius_m**2 - x**2)
+    points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    points[:, 2] += np.random.default_rng(5).normal(0.0, noise_m, len(points))
+    return points
+
+
+@pytest.mark.parametrize(("pitch_m", "noise_m"), [(0.002, 0.0005), (0.002, 0.001), (0.004, 0.002)])
+def test_noise_and_pitch_are_measured(pitch_m, noise_m):
+    found = grain_of(curved(pitch_m, noise_m))
+    # the surface is tilted against the noise: a little less, and points a little farther apart
+    assert 0.7 * noise_m < found.noise_m < 1.15 * noise_m
+    assert pitch_m <= found.pitch_m < 1.5 * pitch_m
+
+
+def test_the_noise_does_not_depend_on_where_the_points_are():
+    points = curved(0.003, 0.001)
+    moved = points + np.array([5.0, -2.0, 1.0])
+    assert grain_of(moved).noise_m == pytest.approx(grain_of(points).noise_m, rel=1e-6)
+
+
+def test_nothing_is_changed_for_points_as_good_as_the_config_is_for():
+    config = RotationConfig()
+    assert suited(config, Grain(0.7 * config.noise_m, config.pitch_m)) == config
+    assert suited(config, Grain(0.0, 0.001)) == config
+
+
+def test_noisier_points_widen_fits_and_steps_and_coarser_ones_spacing_and_rims():
+    config = RotationConfig()
+    noisy = suited(config, Grain(0.002, config.pitch_m))
+    assert noisy.noise_m > 2 * config.noise_m
+    assert noisy.fit_m > config.fit_m and noisy.view_fit_m > config.view_fit_m
+    assert noisy.step_m > config.step_m
+    assert (noisy.spacing_m, noisy.rim_m) == (config.spacing_m, config.rim_m)
+    coarse = suited(config, Grain(0.0005, 2 * config.pitch_m))
+    assert coarse.spacing_m > config.spacing_m
+    assert coarse.link_m / coarse.spacing_m == pytest.approx(config.link_m / config.spacing_m)
+    assert coarse.rim_m == pytest.approx(2 * config.rim_m)
+    assert (coarse.noise_m, coarse.step_m) == (config.noise_m, config.step_m)
+
+
+def test_nothing_is_widened_without_end_nor_against_the_setting():
+    config = RotationConfig()
+    assert suited(config, Grain(1.0, 1.0)) == suited(config, Grain(0.1, 0.1))
+    never = RotationConfig(widen=False)
+    assert suited(never, Grain(0.01, 0.01)) == never
+
+
+def test_the_typical_view_is_the_median():
+    views = [Grain(0.001, 0.002), Grain(0.002, 0.003), Grain(0.009, 0.004)]
+    assert typical(views) == Grain(0.002, 0.003)
+
+
+def test_coarse_points_are_told_with_how_coarse_they_are():
+    config = RotationConfig()
+    assert notices_of(config, Grain(0.8 * config.noise_m, 1.1 * config.pitch_m)) == ()
+    for grain in (Grain(0.002, 0.002), Grain(0.0005, 0.004)):
+        (notice,) = notices_of(config, grain)
+        assert notice.code == "coarse_points"
+        assert f"by {1e3 * grain.noise_m:.1f} mm" in notice.text
+        assert f"are {1e3 * grain.pitch_m:.1f} mm apart" in notice.text

@@ -1,0 +1,92 @@
+"""How noisy and how far apart the points are, and the lengths that suit them.
+
+The lengths of RotationConfig are set for a good stereo rig a little more than a metre away. Noisier
+points need wider fits, but those take more of the layers that hang close together for one: so fits
+are widened by less than the noise would ask for, and samples of one sheet may be farther out of
+line. Where points are farther apart, samples are, too, and both sides of a rim end farther from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.values import Float, Notice
+
+AROUND = 20  # points through which a plane is laid
+LOOKED_AT = 2000  # points of a view, at most
+SEEN_SHARE = 0.75  # of the noise, most that neighbouring points do not have in common
+MOST_NOISE, MOST_PITCH = 4.0, 2.5  # times what the config is for, beyond which nothing is widened
+TOLD_NOISE, TOLD_PITCH = 1.4, 1.3  # times, beyond which the result says so
+
+
+@dataclass(frozen=True)
+class Grain:
+    """Of the points on the item."""
+
+    noise_m: float  # standard deviation from the planes of their nearest neighbours
+    pitch_m: float  # to the nearest neighbour
+
+
+def grain_of(points: Float) -> Grain:
+    """Median noise and pitch of one view's points (n, 3), n > 20.
+
+    Noise that neighbouring points have in common does not show.
+    """
+    some = points[:: max(1, len(points) // LOOKED_AT)]
+    distance, near = cKDTree(points).query(some, k=AROUND)
+    around = points[near] - points[near].mean(axis=1, keepdims=True)
+    across = np.linalg.eigvalsh(around.transpose(0, 2, 1) @ around)[:, 0].clip(0.0)
+    noise = np.sqrt(np.median(across) / (AROUND - 3))  # a plane takes three of them
+    return Grain(float(noise), float(np.median(distance[:, 1])))
+
+
+def typical(grains: Sequence[Grain]) -> Grain:
+    """The median of several views."""
+    return Grain(
+        float(np.median([grain.noise_m for grain in grains])),
+        float(np.median([grain.pitch_m for grain in grains])),
+    )
+
+
+def suited(config: RotationConfig, grain: Grain) -> RotationConfig:
+    """The config with its lengths widened for points noisier or farther apart than it is for."""
+    if not config.widen:
+        return config
+    noise, pitch = _times(config, grain)
+    noise, pitch = min(noise, MOST_NOISE), min(pitch, MOST_PITCH)
+    return replace(
+        config,
+        noise_m=noise * config.noise_m,
+        pitch_m=pitch * config.pitch_m,
+        view_fit_m=noise**0.5 * config.view_fit_m,
+        fit_m=noise**0.3 * pitch**0.6 * config.fit_m,
+        step_m=noise**0.5 * config.step_m,
+        spacing_m=pitch**0.6 * config.spacing_m,
+        link_m=pitch**0.6 * config.link_m,
+        rim_m=pitch * config.rim_m,
+    )
+
+
+def notices_of(config: RotationConfig, grain: Grain) -> tuple[Notice, ...]:
+    """Says that the points are much coarser than the config is for, if they are."""
+    noise, pitch = _times(config, grain)
+    if noise <= TOLD_NOISE and pitch <= TOLD_PITCH:
+        return ()
+    text = (
+        f"the points scatter by {1e3 * grain.noise_m:.1f} mm and are {1e3 * grain.pitch_m:.1f} mm "
+        f"apart, the method is set for {SEEN_SHARE * 1e3 * config.noise_m:.1f} and "
+        f"{1e3 * config.pitch_m:.1f} mm: layers that hang close together may be taken for one; "
+        "hold the item nearer to the rig"
+    )
+    return (Notice("coarse_points", text),)
+
+
+def _times(config: RotationConfig, grain: Grain) -> tuple[float, float]:
+    """How much noisier and farther apart, at least 1."""
+    noise = grain.noise_m / (SEEN_SHARE * config.noise_m)
+    return max(1.0, noise), max(1.0, grain.pitch_m / config.pitch_m)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from flat import lying_at
 
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import RecognitionConfig
-from vflatten_ros.core.recognition import fit_again, recognise
+from vflatten_ros.core.recognition import recognise, recognise_again
 from vflatten_ros.core.values import Outline
 
 STEP_M = 0.004
@@ -57,10 +60,52 @@ def test_a_fit_goes_on_from_where_it_was_when_its_notch_has_closed():
     """The waist, which is narrower in most shorts, is the wider end here."""
     shorts = [[0, 0], [0.14, 0], [0.17, 0.14], [0.2, 0], [0.34, 0], [0.36, 0.38], [-0.02, 0.38]]
     closed = [shorts[k] for k in (0, 4, 5, 6)]
-    before = found(shorts).fits["shorts"]
-    again = fit_again(before, *drawn(closed), RecognitionConfig())
-    crotch, waist = (again.template.landmarks[name] for name in ("crotch", "waist_front"))
-    up = again.points()[waist] - again.points()[crotch]
+    before = found(shorts)
+    fit = recognise_again(before, *drawn(closed), TEMPLATES, RecognitionConfig()).fits["shorts"]
+    crotch, waist = (fit.template.landmarks[name] for name in ("crotch", "waist_front"))
+    up = fit.points()[waist] - fit.points()[crotch]
     assert up[1] > 0.1  # as it was; alone it would be fitted the other way round
     anew = recognise(*drawn(closed), TEMPLATES, RecognitionConfig()).fits["shorts"]
     assert (anew.points()[waist] - anew.points()[crotch])[1] < 0
+
+
+def two_legs(inseam_m):
+    """Shorts or trousers with a waist of 0.32 m and a rise of 0.22 m, by the length of the legs."""
+    top = inseam_m + 0.22
+    corners = [[0, 0], [0.16, 0], [0.17, inseam_m], [0.18, 0], [0.34, 0], [0.33, top], [0.01, top]]
+    return drawn(corners)
+
+
+def test_sizes_tell_shorts_from_trousers_once_the_legs_lie_right():
+    config = RecognitionConfig()
+    for was, length_m, then in (("shorts", 0.45, "trousers"), ("trousers", 0.2, "shorts")):
+        before = recognise(*two_legs(0.32), TEMPLATES, config)
+        both = {**before.probabilities, "shorts": 0.5, "trousers": 0.5}
+        before = replace(before, category=was, fit=before.fits[was], probabilities=both)
+        again = recognise_again(before, *two_legs(length_m), TEMPLATES, config)
+        assert again.category == then
+        assert again.probabilities[then] > 0.9
+        assert sum(again.probabilities.values()) == pytest.approx(sum(both.values()))
+        assert again.fit is again.fits[then]
+        inseam = again.fit.template.size_values(again.fit.state)[2]
+        assert inseam == pytest.approx(length_m, rel=0.05)
+
+
+def test_a_category_that_was_out_of_the_question_does_not_come_back():
+    config = RecognitionConfig()
+    before = recognise(*two_legs(0.2), TEMPLATES, config)
+    assert before.probabilities["trousers"] < 1e-4
+    again = recognise_again(before, *two_legs(0.45), TEMPLATES, config)
+    assert again.category == "shorts"
+
+
+def test_only_categories_of_one_build_take_over_sizes_and_angles():
+    known = {template.category: template for template in TEMPLATES}
+    shorts, trousers = known["shorts"], known["trousers"]
+    assert shorts.same_build(trousers)
+    assert known["t_shirt"].same_build(known["long_sleeve_shirt"])
+    assert not shorts.same_build(known["skirt"])
+    state = np.linspace(-1.0, 1.0, shorts.dimensions)
+    taken = trousers.state_of(shorts, state)
+    assert not np.allclose(taken, state)
+    assert np.allclose(trousers.place(taken)[0], shorts.place(state)[0], atol=1e-12)

@@ -22,11 +22,11 @@ from vflatten_ros.core.recognition import (
     UNKNOWN,
     Recognition,
     finish,
-    fit_again,
     recognise,
+    recognise_again,
 )
 from vflatten_ros.core.registration import ViewSurface, view_surface
-from vflatten_ros.core.rotation import Unfolded, fuse_views, turn_parts
+from vflatten_ros.core.rotation import fuse_views, turn_parts
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.two_views import flatten_two_views, named_views
@@ -44,6 +44,7 @@ from vflatten_ros.core.values import (
 
 MOST_JUDGED = 3  # corresponding points given, up to which others are found to judge them
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
+AT_REST_M = 0.002  # by which an outline's vertices may be off with its parts at rest
 
 
 def prepare_view(view: View, config: Config) -> ViewSurface:
@@ -150,9 +151,15 @@ def _rotation(
         fit = found.fits[found.category]
         rest = place(fit.template, fit.pose, fit.template.at_rest(fit.state))[0]
         k = fit.template.vertices
-        unfolded = turn_parts(unfolded, fit.points()[:k], rest[:k], config.rotation)
+        swung = fit.points()[:k]
+        if turn and np.abs(swung - rest[:k]).max() < AT_REST_M:
+            break
+        unfolded = turn_parts(unfolded, swung, rest[:k], config.rotation)
         progress("parts", (turn + 0.6) / TURNS)
-        found = _refitted(unfolded, found, config)
+        found = recognise_again(
+            found, unfolded.outline, unfolded.points, tuple(templates), config.recognition
+        )
+    best = replace(best, found=replace(best.found, probabilities=found.probabilities))
     none = np.zeros(0)
     notices = told + unfolded.notices
     if best.untrusted:
@@ -225,21 +232,6 @@ def _described(
         unseen=unseen,
     )
     return replace(garment, enough=enough(garment, config.views))
-
-
-def _refitted(flattened: Unfolded, settled: Recognition, config: Config) -> Recognition:
-    """The settled category, fitted to the item as it lies now; legs together look like a skirt."""
-    before = settled.fits[settled.category]
-    fit = fit_again(before, flattened.outline, flattened.points, config.recognition)
-    near = np.maximum(fit.edge_seen[:, 0], np.roll(fit.edge_seen[:, -1], 1))
-    k = fit.template.vertices
-    return replace(
-        settled,
-        fit=fit,
-        template_uv=fit.points()[:k],
-        template_seen=near[:k] > 0.5,
-        fits={**settled.fits, settled.category: fit},
-    )
 
 
 def _recognised(

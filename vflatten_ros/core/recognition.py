@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,7 @@ BEST = 5  # hypotheses of a category that are refined to the end
 FREEDOM = 25.0  # of an ordinary category: what its pose and sizes cost in evidence
 AS_CUT = 0.2  # of the swing of parts, where nothing turned them
 UNEXPLAINED = 1.5  # what an observation that only others explain costs a category (log odds)
+WORTH_WEIGHING = 1e-4  # probability of a category before loose parts were turned
 HOPELESS = 40.0  # a category with this much more energy than the best is not refined with care
 COARSE = (((12.0, 9.0), 16), ((6.0, 6.0), BEST))  # cuts of the steps, in sigmas; hypotheses kept
 FINE = (5.0, 4.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0)
@@ -101,8 +102,17 @@ def recognise(
     )
 
 
-def fit_again(fit: Fit, outline: Outline, points: FlatPoints, config: RecognitionConfig) -> Fit:
-    """The same category, fitted from where it was, once its loose parts were turned to rest.
+def recognise_again(
+    found: Recognition,
+    outline: Outline,
+    points: FlatPoints,
+    templates: tuple[Template, ...],
+    config: RecognitionConfig,
+) -> Recognition:
+    """The category once the item's loose parts were turned to rest, fitted from where it was.
+
+    Legs together look like a skirt, so only categories of the same build are still weighed against
+    each other. Their sizes tell them apart, and splayed legs hide where the crotch is.
 
     Raises
     ------
@@ -110,11 +120,38 @@ def fit_again(fit: Fit, outline: Outline, points: FlatPoints, config: Recognitio
         As recognise.
     """
     evidence = evidence_from(outline, points, config)
-    pose = np.stack([fit.pose, fit.pose])
-    state = np.stack([fit.state, fit.template.at_rest(fit.state)])
-    pose, state, energy = refine(fit.template, evidence, pose, state, FINE)
+    before = found.fits[found.category]
+    alike = [t for t in templates if t.same_build(before.template)]
+    alike = [t for t in alike if found.probabilities.get(t.category, 0.0) > WORTH_WEIGHING]
+    fits = {t.category: _fitted_from(before, t, evidence) for t in alike or [before.template]}
+    weighed = _probabilities(fits, evidence, config)
+    del weighed[UNKNOWN]
+    together = sum(found.probabilities.get(name, 0.0) for name in fits) / sum(weighed.values())
+    category = max(weighed, key=lambda name: weighed[name])
+    fit = fits[category]
+    near = np.maximum(fit.edge_seen[:, 0], np.roll(fit.edge_seen[:, -1], 1))
+    k = fit.template.vertices
+    return replace(
+        found,
+        category=category,
+        probabilities={**found.probabilities, **{n: together * p for n, p in weighed.items()}},
+        fit=fit,
+        template_uv=fit.points()[:k],
+        template_seen=near[:k] > 0.5,
+        fits={**found.fits, **fits},
+    )
+
+
+def _fitted_from(before: Fit, template: Template, evidence: Evidence) -> Fit:
+    """A category fitted from where another of the same build, or itself, was."""
+    state = before.state
+    if template is not before.template:
+        state = template.state_of(before.template, state)
+    pose = np.stack([before.pose, before.pose])
+    states = np.stack([state, template.at_rest(state)])
+    pose, states, energy = refine(template, evidence, pose, states, FINE)
     best = [int(energy.argmin())]
-    return finish(fit.template, evidence, pose[best], state[best])
+    return finish(template, evidence, pose[best], states[best])
 
 
 def fit_template(template: Template, evidence: Evidence, config: RecognitionConfig) -> Fit:

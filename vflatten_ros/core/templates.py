@@ -119,6 +119,19 @@ class Template:
         rest[..., len(self.sizes) + len(self.parts) :] = 0.0
         return rest
 
+    def same_build(self, other: Template) -> bool:
+        """Whether only typical sizes and angles tell the two apart, as shorts and trousers."""
+        return (self.sizes, self.parts, self.points) == (other.sizes, other.parts, other.points)
+
+    def state_of(self, other: Template, state: Float) -> Float:
+        """State (m,) with the sizes and angles of another category's, of the same build."""
+        n, a = len(self.sizes), len(self.parts)
+        off = np.log(other.size_values(state)) - self.log_typical
+        angle = other.angle + state[n : n + a] * other.spread
+        swing = state[n + a :] * np.tile(other.swing / self.swing, 2)
+        sizes = np.linalg.solve(self.log_spread, off)
+        return np.concatenate([sizes, (angle - self.angle) / self.spread, swing])
+
     def measure(self, state: Float, covariance: Float) -> dict[str, tuple[float, float]]:
         """Named sizes of one cut.
 

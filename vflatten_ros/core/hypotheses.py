@@ -38,7 +38,7 @@ from vflatten_ros.core.values import Progress
 WHOLE = "whole"
 WAYS = (  # how, greatest doubt, badness of what was tried before below which it is left out
     (WHOLE, np.inf, -np.inf),
-    (PUZZLE, 1.0, -0.15),
+    (PUZZLE, 1.0, -0.05),
     (WHOLE, 1.0, 0.05),
     (CLOSED, 1.0, 0.05),
     (PUZZLE, 0.4, 0.05),

@@ -4,7 +4,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 
 BAG ?= bags/LS1_1
-PROTOCOL ?= $(wildcard $(BAG)/protocol.json)
+PROTOCOL ?=
 PYTHON ?= python3
 
 # Runs what follows in the built package's environment.

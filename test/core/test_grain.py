@@ -55,6 +55,10 @@ def test_noisier_points_widen_fits_and_steps_and_coarser_ones_spacing_and_rims()
 def test_nothing_is_widened_without_end_nor_against_the_setting():
     config = RotationConfig()
     assert suited(config, Grain(1.0, 1.0)) == suited(config, Grain(0.1, 0.1))
+    widest = RotationConfig(noise_m=0.02, fit_m=0.05, rim_m=0.05)
+    wider = suited(widest, Grain(0.03, 0.01))
+    assert (wider.noise_m, wider.fit_m, wider.rim_m) == (0.02, 0.05, 0.05)  # the ranges' ends
+    assert wider.spacing_m > widest.spacing_m
     never = RotationConfig(widen=False)
     assert suited(never, Grain(0.01, 0.01)) == never
 

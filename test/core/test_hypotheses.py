@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from vflatten_ros.core import hypotheses
+from vflatten_ros.core.config import Config
 from vflatten_ros.core.hypotheses import Tried, settled
 
 
@@ -72,3 +75,25 @@ def test_a_bad_way_and_a_near_tie_of_categories_are_not_to_be_trusted():
     assert not tried().untrusted and not tried(sure=0.75).untrusted
     assert "does not lie flat" in tried(overlap=0.2).untrusted
     assert "60% likely" in tried(sure=0.6, misfit=-0.9).untrusted
+
+
+@dataclass(frozen=True)
+class Linked:
+    doubt: float = 0.0
+
+
+@pytest.mark.parametrize(("misfit", "looked"), [(-0.5, 0), (0.5, 1)])
+def test_ramps_are_looked_for_once_and_only_where_the_first_way_does_not_settle_it(
+    monkeypatch, misfit, looked
+):
+    made, found = [], []
+    monkeypatch.setattr(hypotheses, "link_surface", lambda *_: Linked())
+    monkeypatch.setattr(hypotheses, "doubts", lambda *_: made.append(1) or 2.0)
+    monkeypatch.setattr(hypotheses, "unfold_surface", lambda surface, *_: found.append(surface))
+    monkeypatch.setattr(hypotheses, "_recognised", lambda *_: tried(misfit=misfit))
+    whole = [way for way in hypotheses.WAYS if way[0] == hypotheses.WHOLE]
+    monkeypatch.setattr(hypotheses, "WAYS", (*whole, whole[-1]))
+    hypotheses.likeliest(None, (), Config(), lambda *_: None)
+    assert len(made) == looked
+    assert [surface.doubt for surface in found] == [0.0, 2.0, 2.0][: len(found)]
+    assert len(found) == 1 + 2 * looked

@@ -109,3 +109,5 @@ def test_only_categories_of_one_build_take_over_sizes_and_angles():
     taken = trousers.state_of(shorts, state)
     assert not np.allclose(taken, state)
     assert np.allclose(trousers.place(taken)[0], shorts.place(state)[0], atol=1e-12)
+    rigid = replace(trousers, spread=np.zeros(1), swing=np.zeros(1))
+    assert np.allclose(rigid.state_of(shorts, state)[len(rigid.sizes) :], 0.0)

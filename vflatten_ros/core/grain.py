@@ -9,7 +9,7 @@ line. Where points are farther apart, samples are, too, and both sides of a rim 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -54,22 +54,27 @@ def typical(grains: Sequence[Grain]) -> Grain:
 
 
 def suited(config: RotationConfig, grain: Grain) -> RotationConfig:
-    """The config with its lengths widened for points noisier or farther apart than it is for."""
+    """The config with its lengths widened for points noisier or farther apart than it is for.
+
+    No length goes beyond its allowed range.
+    """
     if not config.widen:
         return config
     noise, pitch = _times(config, grain)
     noise, pitch = min(noise, MOST_NOISE), min(pitch, MOST_PITCH)
-    return replace(
-        config,
-        noise_m=noise * config.noise_m,
-        pitch_m=pitch * config.pitch_m,
-        view_fit_m=noise**0.5 * config.view_fit_m,
-        fit_m=noise**0.3 * pitch**0.6 * config.fit_m,
-        step_m=noise**0.5 * config.step_m,
-        spacing_m=pitch**0.6 * config.spacing_m,
-        link_m=pitch**0.6 * config.link_m,
-        rim_m=pitch * config.rim_m,
-    )
+    times = {
+        "noise_m": noise,
+        "pitch_m": pitch,
+        "view_fit_m": noise**0.5,
+        "fit_m": noise**0.3 * pitch**0.6,
+        "step_m": noise**0.5,
+        "spacing_m": pitch**0.6,
+        "link_m": pitch**0.6,
+        "rim_m": pitch,
+    }
+    most = {field.name: field.metadata["high"] for field in fields(config)}
+    wider = {name: min(most[name], by * getattr(config, name)) for name, by in times.items()}
+    return replace(config, **wider)
 
 
 def notices_of(config: RotationConfig, grain: Grain) -> tuple[Notice, ...]:

@@ -252,7 +252,6 @@ def _recognised(
     odds[UNKNOWN] = np.exp(unknown - best.chance)
     everything = sum(odds.values())
     names = [*(t.category for t in templates), UNKNOWN]
-    near = np.maximum(fit.edge_seen[:, 0], np.roll(fit.edge_seen[:, -1], 1))
     known = odds[UNKNOWN] < 1.0
     count = best.template.vertices if known else 0
     return best.flattened, Recognition(
@@ -266,6 +265,6 @@ def _recognised(
         probabilities={name: float(odds.get(name, 0.0) / everything) for name in names},
         fit=fit,
         template_uv=fit.points()[:count],
-        template_seen=near[:count] > 0.5,
+        template_seen=fit.vertex_seen()[:count],
         fits={best.template.category: fit},
     )

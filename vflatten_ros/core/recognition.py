@@ -90,14 +90,13 @@ def recognise(
     known = {name: p for name, p in probabilities.items() if name != UNKNOWN}
     fit = fits[max(known, key=lambda name: known[name])]
     k = fit.template.vertices if category != UNKNOWN else 0
-    near = np.maximum(fit.edge_seen[:, 0], np.roll(fit.edge_seen[:, -1], 1))
     return Recognition(
         category=category,
         scores=scores,
         probabilities=probabilities,
         fit=fit,
         template_uv=fit.points()[:k],
-        template_seen=near[:k] > 0.5,
+        template_seen=fit.vertex_seen()[:k],
         fits=fits,
     )
 
@@ -129,7 +128,6 @@ def recognise_again(
     together = sum(found.probabilities.get(name, 0.0) for name in fits) / sum(weighed.values())
     category = max(weighed, key=lambda name: weighed[name])
     fit = fits[category]
-    near = np.maximum(fit.edge_seen[:, 0], np.roll(fit.edge_seen[:, -1], 1))
     k = fit.template.vertices
     return replace(
         found,
@@ -137,7 +135,7 @@ def recognise_again(
         probabilities={**found.probabilities, **{n: together * p for n, p in weighed.items()}},
         fit=fit,
         template_uv=fit.points()[:k],
-        template_seen=near[:k] > 0.5,
+        template_seen=fit.vertex_seen()[:k],
         fits={**found.fits, **fits},
     )
 

@@ -42,7 +42,7 @@ class ViewSurface:
     index: Int  # (n,) row of the view's points
     camera: Float  # (3,) hanger frame
     tree: cKDTree  # of smooth
-    grain: Grain
+    grain: Grain  # of the points
     sight: Sight | None = None  # in the hanger frame; None if the cloud is not that of a camera
 
 

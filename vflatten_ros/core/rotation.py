@@ -85,7 +85,7 @@ class Fused:
     normals: Float  # (m, 3)
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
-    grain: Grain  # of the points, in most views
+    grain: Grain  # of the points, median of the views
     sights: tuple[PlacedSight, ...] = ()  # none: whether cloth goes on is told by the samples
     given: Judged = NOTHING_GIVEN  # corresponding points
     notices: tuple[Notice, ...] = ()
@@ -365,8 +365,7 @@ def fuse_views(
     if prints is not None and looked:
         progress("fuse", 0.9)
         slid = slide_m([(placed[i], placed[j]) for i, j in looked], prints)
-    doubted = prints is not None and slid is not None and slid > prints.slide_m
-    if slid is not None and doubted:
+    if prints is not None and slid is not None and slid > prints.slide_m:
         notices = (*notices, slide_notice(slid))
     checked = judged(given, placed, limits or IntegrationConfig())
     sights = tuple(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vflatten_ros.core.evidence import Evidence, look_up
 from vflatten_ros.core.templates import Float, Template
+from vflatten_ros.core.values import Bool
 
 Int = NDArray[np.int64]
 
@@ -42,6 +43,12 @@ class Fit:
     def points(self) -> Float:
         """(p, 2) all points of the template in the flat frame."""
         return place(self.template, self.pose, self.state)[0]
+
+    def vertex_seen(self) -> Bool:
+        """(k,) whether a view shows the outline near each of its vertices."""
+        near = np.maximum(self.edge_seen[:, 0], np.roll(self.edge_seen[:, -1], 1))
+        seen: Bool = near > 0.5
+        return seen
 
 
 def place(template: Template, pose: Float, state: Float) -> tuple[Float, Float]:

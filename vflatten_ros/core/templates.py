@@ -127,10 +127,13 @@ class Template:
         """State (m,) with the sizes and angles of another category's, of the same build."""
         n, a = len(self.sizes), len(self.parts)
         off = np.log(other.size_values(state)) - self.log_typical
-        angle = other.angle + state[n : n + a] * other.spread
-        swing = state[n + a :] * np.tile(other.swing / self.swing, 2)
-        sizes = np.linalg.solve(self.log_spread, off)
-        return np.concatenate([sizes, (angle - self.angle) / self.spread, swing])
+        turned = other.angle + state[n : n + a] * other.spread - self.angle
+        swung = state[n + a :] * np.tile(other.swing, 2)
+        scale = np.r_[self.spread, self.swing, self.swing]
+        parts = np.zeros(3 * a)  # a part that cannot turn stays as it is
+        np.divide(np.r_[turned, swung], scale, out=parts, where=scale > 0)
+        taken: Float = np.r_[np.linalg.solve(self.log_spread, off), parts]
+        return taken
 
     def measure(self, state: Float, covariance: Float) -> dict[str, tuple[float, float]]:
         """Named sizes of one cut.

@@ -10,8 +10,9 @@ import garments
 import pytest
 
 from vflatten_ros import job
-from vflatten_ros.core import pipeline
+from vflatten_ros.core import pipeline, registration
 from vflatten_ros.core.config import Config, RotationConfig
+from vflatten_ros.core.errors import NotEnoughViews
 
 CONFIG = Config()
 COARSE = dataclasses.replace(CONFIG, rotation=RotationConfig(view_fit_m=0.02))
@@ -20,17 +21,22 @@ COARSE = dataclasses.replace(CONFIG, rotation=RotationConfig(view_fit_m=0.02))
 @pytest.fixture
 def calls(monkeypatch):
     """The method replaced by notes of how it was called."""
-    noted = SimpleNamespace(prepared=[], given=None)
+    noted = SimpleNamespace(prepared=[], given=None, folded=[], so_far=None)
 
     def prepare_view(view, config):
         noted.prepared.append(view.view_id)
         return f"surface of {view.view_id}"
 
-    def flatten_garment(views, pairs, templates, config, progress, prepared):
-        noted.given = dict(prepared)
+    def fold_in(surfaces, config, so_far):
+        noted.folded.append(list(surfaces))
+        return tuple(surfaces)
+
+    def flatten_garment(views, pairs, templates, config, progress, prepared, so_far):
+        noted.given, noted.so_far = dict(prepared), so_far
         return garments.example_garment()
 
     monkeypatch.setattr(pipeline, "prepare_view", prepare_view)
+    monkeypatch.setattr(registration, "fold_in", fold_in)
     monkeypatch.setattr(pipeline, "flatten_garment", flatten_garment)
     monkeypatch.setattr(job, "serialized", lambda garment, views: {})
     return noted
@@ -58,6 +64,31 @@ def test_what_was_prepared_with_other_settings_is_not_used(calls):
     work.prepare(view, COARSE)
     flatten(work, (view,), CONFIG)
     assert calls.prepared == [view.view_id] * 2
+
+
+def test_views_are_folded_in_as_they_arrive_in_the_order_of_their_ids(calls):
+    first, second = garments.example_views()
+    names = [f"surface of {view.view_id}" for view in (first, second)]
+    work = job.Flattening(())
+    work.prepare(second, CONFIG)
+    work.prepare(first, CONFIG)
+    assert calls.folded == [names[1:], names]
+    flatten(work, (first, second), CONFIG)
+    assert calls.so_far == tuple(names)
+
+
+def test_a_view_that_shows_nothing_is_left_to_the_method(calls, monkeypatch):
+    def nothing(view, config):
+        calls.prepared.append(view.view_id)
+        raise NotEnoughViews("5 points on the item")
+
+    monkeypatch.setattr(pipeline, "prepare_view", nothing)
+    (view, _) = garments.example_views()
+    work = job.Flattening(())
+    work.prepare(view, CONFIG)
+    flatten(work, (view,), CONFIG)
+    assert calls.prepared == [view.view_id]  # once
+    assert calls.given == {} and calls.so_far is None
 
 
 def test_what_was_prepared_goes_with_its_view(calls):

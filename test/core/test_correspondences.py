@@ -10,8 +10,8 @@ from sheet import HEIGHT_M, WIDTH_M, a_print, plain, seen_from, stripes
 
 from vflatten_ros.core.config import CorrespondenceConfig, RotationConfig
 from vflatten_ros.core.correspondences import as_pairs, common_cloth, place_view, spread
-from vflatten_ros.core.features import agreeing, common_features, features_of
 from vflatten_ros.core.geometry import rigid
+from vflatten_ros.core.prints import agreeing, common_features
 from vflatten_ros.core.registration import view_surface
 
 CONFIG = CorrespondenceConfig()
@@ -24,7 +24,7 @@ def placed(colour=None, angles=ANGLES, noise=0.0, shift=(0.0, 0.0, 0.0)):
     seen = [seen_from(k, angle, colour=colour, noise=noise) for k, angle in enumerate(angles)]
     poses = [np.eye(4), rigid(np.eye(3), np.array(shift))]
     views = [
-        place_view(view, view_surface(view, RotationConfig()), pose)
+        place_view(view, view_surface(view, RotationConfig(), prints=True), pose)
         for (view, _), pose in zip(seen, poses, strict=True)
     ]
     return views, [flat for _, flat in seen]
@@ -87,7 +87,7 @@ def test_the_chosen_points_are_spread_and_start_with_the_surest():
 
 def test_a_print_gives_features_at_the_same_place_of_the_cloth():
     views, flats = placed(a_print)
-    found = common_features(*views, *(features_of(v) for v in views), CONFIG)
+    found = common_features(*views, CONFIG)
     assert len(found.a) > 20
     assert np.median(misses(views, flats, found)) < PIXEL_M
     assert np.quantile(misses(views, flats, found), 0.95) < 2 * PIXEL_M
@@ -98,7 +98,7 @@ def test_a_print_tells_how_far_surfaces_have_slid_along_one_another():
     views, flats = placed(a_print, shift=(0.0, 0.0, 0.008))
     slid = common_cloth(*views, CONFIG)
     assert np.median(misses(views, flats, slid)) > 0.006
-    found = common_features(*views, *(features_of(v) for v in views), CONFIG)
+    found = common_features(*views, CONFIG)
     assert len(found.a) > 10
     assert np.median(misses(views, flats, found)) < PIXEL_M
     off = views[1].points[found.b] - views[0].points[found.a]
@@ -107,14 +107,14 @@ def test_a_print_tells_how_far_surfaces_have_slid_along_one_another():
 
 def test_plain_fabric_gives_few_features_and_no_wrong_ones():
     views, _ = placed(plain)
-    found = common_features(*views, *(features_of(v) for v in views), CONFIG)
+    found = common_features(*views, CONFIG)
     assert len(found.a) < 5
-    assert not len(features_of(placed()[0][0]).at)  # no colour at all
+    assert not len(placed()[0][0].features.at)  # no colour at all
 
 
 def test_stripes_are_not_taken_for_their_neighbours():
     views, flats = placed(stripes)
-    found = common_features(*views, *(features_of(v) for v in views), CONFIG)
+    found = common_features(*views, CONFIG)
     assert (misses(views, flats, found) > 0.008).mean() < 0.05 if len(found.a) else True
 
 
@@ -132,8 +132,7 @@ def test_features_count_only_if_they_agree_on_one_motion():
 
 def test_the_same_views_give_the_same_features():
     one, other = (
-        common_features(*views, *(features_of(v) for v in views), CONFIG)
-        for views in (placed(a_print)[0], placed(a_print)[0])
+        common_features(*views, CONFIG) for views in (placed(a_print)[0], placed(a_print)[0])
     )
     for field in dataclasses.fields(one):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))

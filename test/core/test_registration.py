@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from vflatten_ros.core import registration
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.geometry import inverse, rotation_about, transform_points
-from vflatten_ros.core.registration import register_views, view_surface
+from vflatten_ros.core.registration import fold_in, register_views, view_surface
 from vflatten_ros.core.values import Calibration, View
 
 CALIBRATION = Calibration(
@@ -66,6 +68,35 @@ def test_sway_and_lag_are_undone():
     rms = [float(np.sqrt((p**2).sum(2).mean())) for p in (before, after)]
     assert rms[0] > 0.003
     assert rms[1] < 0.0006  # a fifth of the sway; the noise is half a millimetre
+
+
+def test_views_folded_in_as_they_come_give_the_same(monkeypatch):
+    """However far they were folded in before, also if a view went meanwhile."""
+    rng = np.random.default_rng(3)
+    motions = [(rng.normal(0, 0.002, 3), np.radians(rng.normal(0, 0.3))) for _ in range(8)]
+    config = RotationConfig()
+    surfaces = [view_surface(v, config) for v in views_of(motions, noise_m=0.0005)]
+    at_once = register_views(surfaces, config)
+    half = fold_in(surfaces[:4], config)
+    other = fold_in([surfaces[0], surfaces[2], *surfaces[3:]], config, half)
+    coarse = fold_in(surfaces, replace(config, register_points=300), half)
+    for so_far in (half, fold_in(surfaces[4:], config, half), other, coarse):
+        np.testing.assert_array_equal(register_views(surfaces, config, so_far=so_far), at_once)
+    everything = fold_in(surfaces, config, half)
+    monkeypatch.delattr(registration, "_placed_by")  # nothing is left to be placed
+    np.testing.assert_array_equal(register_views(surfaces, config, so_far=everything), at_once)
+
+
+def test_each_view_is_placed_by_those_before_it():
+    """Most of the sway is undone, and all of a shifted axis known, before the last one comes."""
+    rng = np.random.default_rng(3)
+    motions = [(rng.normal(0, 0.002, 3), np.radians(rng.normal(0, 0.3))) for _ in range(16)]
+    config = RotationConfig()
+    surfaces = [view_surface(v, config) for v in views_of(motions, noise_m=0.0005)]
+    folded = fold_in(surfaces, config)
+    before, after = places([np.eye(4)] * 16, motions), places(folded.poses, motions)
+    assert np.linalg.norm(np.diff(before, axis=0), axis=2).mean() > 0.003
+    assert np.linalg.norm(np.diff(after, axis=0), axis=2).mean() < 0.001
 
 
 def test_a_shifted_axis_is_found_from_all_views():

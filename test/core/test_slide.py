@@ -21,7 +21,7 @@ def views(colour):
 
 def slid(steps_m):
     """A registration that puts every view higher than the one before."""
-    return lambda surfaces, config, progress: [
+    return lambda surfaces, config, progress, so_far: [
         rigid(np.eye(3), np.array([0.0, 0.0, k * steps_m])) for k in range(len(surfaces))
     ]
 

@@ -22,8 +22,8 @@ from vflatten_ros.core.correspondences import (
     spread,
 )
 from vflatten_ros.core.errors import DisconnectedSurface, NotEnoughViews, VFlattenError
-from vflatten_ros.core.features import common_features, features_of
 from vflatten_ros.core.observation import Observation
+from vflatten_ros.core.prints import common_features
 from vflatten_ros.core.recognition import Recognition
 from vflatten_ros.core.registration import ViewSurface, view_surface
 from vflatten_ros.core.turntable import angle_between
@@ -56,11 +56,12 @@ def placed_views(
     prepared: Mapping[int, ViewSurface],
 ) -> list[PlacedView]:
     """The views in one frame; those with hardly any points are left out."""
-    kept, surfaces = [], []
+    kept, surfaces, prints = [], [], config.correspondences.features
     for k, view in enumerate(views):
         progress("surface", k / len(views))
         with suppress(NotEnoughViews):
-            surfaces.append(prepared.get(view.view_id) or view_surface(view, config.rotation))
+            surface = prepared.get(view.view_id)
+            surfaces.append(surface or view_surface(view, config.rotation, prints))
             kept.append(view)
     progress("register", 0.0)
     return place_views(kept, surfaces, config.rotation, progress)
@@ -71,7 +72,7 @@ def corresponding(a: PlacedView, b: PlacedView, config: Config) -> tuple[Corresp
     settings = config.correspondences
     found = common_cloth(a, b, settings)
     if settings.features:
-        seen = common_features(a, b, features_of(a), features_of(b), settings)
+        seen = common_features(a, b, settings)
         found = Matches(
             np.r_[found.a, seen.a], np.r_[found.b, seen.b], np.r_[found.confidence, seen.confidence]
         )

@@ -537,7 +537,7 @@ class RotationConfig(Checked):
     register_reach_m: float = option(
         0.008, "Points farther apart are not the same cloth, m.", low=0.001, high=0.1
     )
-    register_rounds: int = option(6, "Most rounds of the registration.", low=1, high=100)
+    register_rounds: int = option(4, "Most rounds of the registration.", low=1, high=100)
     spacing_m: float = option(0.004, "Spacing of the surface samples, m.", low=0.001, high=0.05)
     fit_m: float = option(
         0.007, "Radius of the local fit of a sample to all views, m.", low=0.002, high=0.05

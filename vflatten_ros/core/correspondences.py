@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import CorrespondenceConfig, IntegrationConfig, RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
+from vflatten_ros.core.features import Features
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.registration import ViewSurface, register_views
 from vflatten_ros.core.values import Correspondence, Float, Int, Notice, Progress, View, no_progress
@@ -37,7 +39,12 @@ class PlacedView:
     normals: Float  # (n, 3) unit, outwards
     row: Int  # (n,) row of the view's points
     facing: Float  # (n,) cosine of the angle between the normal and the direction to the camera
-    tree: cKDTree  # of the points
+    features: Features  # common frame
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the points."""
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +77,13 @@ def place_view(view: View, surface: ViewSurface, pose: Float) -> PlacedView:
     """One view's surface in the frame that `pose` (4, 4) takes its hanger coordinates to."""
     toward = surface.camera - surface.smooth
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    points = transform_points(pose, surface.smooth)
     return PlacedView(
         view=view,
-        points=points,
+        points=transform_points(pose, surface.smooth),
         normals=transform_directions(pose, surface.normals),
         row=surface.index,
         facing=(toward * surface.normals).sum(1),
-        tree=cKDTree(points, balanced_tree=False, compact_nodes=False),
+        features=surface.features.turned(pose),
     )
 
 

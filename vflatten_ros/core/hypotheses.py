@@ -52,6 +52,7 @@ LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more t
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
 ASIDE = 3.0  # of the share that is left out in large groups, beside: it can be no noise
 WORTH_PLACING = 0.1  # share of the samples of a group
+HOPELESS = 0.8  # misfit of the largest group, above which none is: that group is laid out wrong
 PLACED_WAYS = 2  # categories by which groups are placed that are looked at
 
 
@@ -169,30 +170,30 @@ class _Ways:
             return _recognised(unfolded, self._templates, config, progress)
         if doubt not in self._grouped:
             self._grouped[doubt] = group_pieces(self._doubted, doubt, config.rotation, progress)
-        grouped = self._grouped[doubt]
-        worth = [k for k, mask in enumerate(grouped.masks) if k == 0 or mask.mean() > WORTH_PLACING]
-        laid = [unfold_group(grouped, k, how, config.rotation, progress) for k in worth]
-        return _from_groups(laid, self._templates, config, progress)
+        return self._from_groups(self._grouped[doubt], how)
 
-
-def _from_groups(
-    laid: Sequence[Unfolded], templates: tuple[Template, ...], config: Config, progress: Progress
-) -> Tried:
-    """The largest group by itself, or with the others placed beside it, whichever is better."""
-    alone = _recognised(laid[0], templates, config, progress)
-    tries = [replace(alone, aside=sum(group.share for group in laid[1:]))]
-    if len(laid) > 1:
+    def _from_groups(self, grouped: Grouped, how: str) -> Tried:
+        """The largest group by itself, or with others placed beside it, whichever is better."""
+        config, progress = self._config, self._progress
+        laid = [unfold_group(grouped, 0, how, config.rotation, progress)]
+        alone = _recognised(laid[0], self._templates, config, progress)
+        large = [k for k, mask in enumerate(grouped.masks) if k and mask.mean() > WORTH_PLACING]
+        alone = replace(alone, aside=sum(float(grouped.masks[k].mean()) for k in large))
+        if not large or alone.found.fit is None or alone.found.fit.misfit > HOPELESS:
+            return alone
+        laid += [unfold_group(grouped, k, how, config.rotation, progress) for k in large]
         groups = [Group(one.points, one.side, one.outline) for one in laid]
-        placings = place_groups(groups, templates, config, progress)
+        placings = place_groups(groups, self._templates, config, progress)
         least = placings[0].cost
         odds = {p.template.category: float(np.exp(least - p.cost)) for p in placings}
+        tries = [alone]
         for placing in placings[:PLACED_WAYS]:
             sigma_m = config.assembly.sigma_m
             beside = put_beside(laid, placing.motions, sigma_m, config.rotation)
-            only = tuple(t for t in templates if t.category == placing.template.category)
+            only = tuple(t for t in self._templates if t.category == placing.template.category)
             tried = _recognised(beside, only, config, progress)
             tries.append(replace(tried, found=_among(tried.found, odds)))
-    return _best(tries)
+        return _best(tries)
 
 
 def _among(found: Recognition, odds: Mapping[str, float]) -> Recognition:

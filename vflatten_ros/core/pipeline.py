@@ -25,7 +25,7 @@ from vflatten_ros.core.recognition import (
     recognise,
     recognise_again,
 )
-from vflatten_ros.core.registration import ViewSurface, view_surface
+from vflatten_ros.core.registration import Folded, ViewSurface, view_surface
 from vflatten_ros.core.rotation import fuse_views, turn_parts
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
@@ -57,7 +57,7 @@ def prepare_view(view: View, config: Config) -> ViewSurface:
     VFlattenError
         As flatten_garment would of this view.
     """
-    return view_surface(view, config.rotation)
+    return view_surface(view, config.rotation, config.correspondences.features)
 
 
 def flatten_garment(
@@ -67,6 +67,7 @@ def flatten_garment(
     config: Config,
     progress: Progress = no_progress,
     prepared: Mapping[int, ViewSurface] | None = None,
+    so_far: Folded | None = None,
 ) -> FlatGarment:
     """Lay a hanging item flat: its outline, category, sizes and named places.
 
@@ -84,6 +85,8 @@ def flatten_garment(
     progress : Progress
     prepared : mapping of int to ViewSurface, optional
         Results of prepare_view by view_id, with the same config.
+    so_far : Folded, optional
+        Result of fold_in for them, made as the views arrived. 'kita2019' does not use it.
 
     Raises
     ------
@@ -92,8 +95,13 @@ def flatten_garment(
     """
     if not views:
         raise NotEnoughViews("no views to flatten")
-    method = {"kita2019": _kita2019, "rotation": _rotation}[config.method]
-    flattened, settled = method(views, correspondences, templates, config, progress, prepared or {})
+    done = prepared or {}
+    if config.method == "rotation":
+        flattened, settled = _rotation(
+            views, correspondences, templates, config, progress, done, so_far
+        )
+    else:
+        flattened, settled = _kita2019(views, correspondences, templates, config, progress, done)
     return _described(flattened, settled, views, templates, config, progress)
 
 
@@ -130,6 +138,7 @@ def _rotation(
     config: Config,
     progress: Progress,
     prepared: Mapping[int, ViewSurface],
+    so_far: Folded | None,
 ) -> tuple[Flattened, Recognition | None]:
     """The automatic method: all views of a rotation."""
     fused = fuse_views(
@@ -140,6 +149,7 @@ def _rotation(
         correspondences,
         config.integration,
         config.correspondences,
+        so_far,
     )
     config = replace(config, rotation=suited(config.rotation, fused.grain))
     given, told = fused.given, fused.notices + fused.given.notices

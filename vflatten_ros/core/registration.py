@@ -1,25 +1,27 @@
 """Views of one rotation, brought into one frame: the wrist angle first, then their shared surface.
 
 The item sways by millimetres and lags behind the wrist by a fraction of a degree, and the axis
-calibration may be off. Every view gets a small rigid correction, and all views together one
-correction of the axis. All are found at once from point-to-plane distances between overlapping
-views (Chen & Medioni 1992), the first and the last ones included, and held by a prior: without it
-smooth legs slide along themselves.
+calibration may be off. As it comes, a view is placed by those before it. In the end every view gets
+a small rigid correction, and all views together one correction of the axis. All are found at once
+from point-to-plane distances between overlapping views (Chen & Medioni 1992), the first and the
+last ones included, and held by a prior: without it smooth legs slide along themselves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import takewhile
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
+from vflatten_ros.core.features import NO_FEATURES, Features, features_of
 from vflatten_ros.core.geometry import Float, inverse, rigid, rotation_about, transform_points
-from vflatten_ros.core.grain import Grain, grain_of, suited
+from vflatten_ros.core.grain import Grain, grain_of, suited, typical
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.sight import Sight, sight_of
 from vflatten_ros.core.values import Int, Progress, View, no_progress
@@ -27,6 +29,9 @@ from vflatten_ros.core.values import Int, Progress, View, no_progress
 MIN_POINTS = 100  # a view with fewer item points shows nothing that could be placed
 PAIR_POINTS = 300.0  # noise is alike in neighbouring pixels: more pairs than this say no more
 MOST_PARTNERS = 4  # on either side of a view
+FOLD_ROUNDS = 3  # of placing one view by those before it
+SETTLED = 2e-5  # step, metres and radians, far below the noise
+AXIS = 4  # numbers of the axis error: two of its lean, two of its place
 NEIGHBOURS, RADIUS_M, LEAST = 24, 0.012, 8  # most points of a plane of this radius, and fewest
 
 
@@ -44,12 +49,20 @@ class ViewSurface:
     tree: cKDTree  # of smooth
     grain: Grain  # of the points
     sight: Sight | None = None  # in the hanger frame; None if the cloud is not that of a camera
+    features: Features = NO_FEATURES  # of the smooth surface, hanger frame
 
 
-def view_surface(view: View, config: RotationConfig) -> ViewSurface:
+def view_surface(view: View, config: RotationConfig, prints: bool = False) -> ViewSurface:
     """Local planes of one view's points. Needs no other view: do it as the view arrives.
 
     Points with too few neighbours for a plane (flying pixels, shreds) are left out.
+
+    Parameters
+    ----------
+    view : View
+    config : RotationConfig
+    prints : bool
+        Look for features of the colour image, too.
 
     Raises
     ------
@@ -67,18 +80,20 @@ def view_surface(view: View, config: RotationConfig) -> ViewSurface:
     grain = grain_of(points)
     smooth, normals, count = _planes(points, suited(config, grain).view_fit_m)
     normals = normals * np.where(((camera - points) * normals).sum(1) < 0, -1.0, 1.0)[:, None]
-    good = count >= LEAST
+    row = np.flatnonzero(count >= LEAST)
+    smooth = smooth[row]
     return ViewSurface(
         view.view_id,
         view.angle_rad,
-        points[good],
-        smooth[good],
-        normals[good],
-        np.flatnonzero(good),
+        points[row],
+        smooth,
+        normals[row],
+        row,
         camera,
-        cKDTree(smooth[good]),
+        cKDTree(smooth),
         grain,
         sight_of(points, view.pixel, view.shape),
+        features_of(view, smooth, row) if prints else NO_FEATURES,
     )
 
 
@@ -97,17 +112,81 @@ def _planes(points: Float, radius_m: float) -> tuple[Float, Float, Int]:
     return smooth, normals, found.sum(1)
 
 
+@dataclass(frozen=True, eq=False)
+class Folded:
+    """Views in the order in which they came, each placed by those before it."""
+
+    surfaces: tuple[ViewSurface, ...]
+    poses: tuple[Float, ...]  # (4, 4) each: takes its hanger coordinates to the common ones
+    config: RotationConfig
+
+
+def fold_in(
+    surfaces: Sequence[ViewSurface], config: RotationConfig, so_far: Folded | None = None
+) -> Folded:
+    """Place every view by those before it: what can be done before the last one comes.
+
+    Parameters
+    ----------
+    surfaces : sequence of ViewSurface
+        In the order in which they came.
+    config : RotationConfig
+    so_far : Folded, optional
+        An earlier result. What it has of the first views is kept; the result is the same without.
+    """
+    poses: list[Float] = []
+    if so_far is not None and so_far.config == config:
+        known = zip(surfaces, so_far.surfaces, so_far.poses, strict=False)
+        poses += [pose for _, _, pose in takewhile(lambda found: found[0] is found[1], known)]
+    for k in range(len(poses), len(surfaces)):
+        poses.append(_placed_by(surfaces[:k], poses, surfaces[k], config))
+    return Folded(tuple(surfaces), tuple(poses), config)
+
+
+def _placed_by(
+    before: Sequence[ViewSurface], poses: Sequence[Float], new: ViewSurface, config: RotationConfig
+) -> Float:
+    """Pose of a view by those before it, which stay: the axis as they have it, then the surface."""
+    config = suited(config, new.grain)
+    guess = _effect(new) @ _axis_error(before, poses, config)
+    pose = _moved(np.eye(4), guess)
+    everyone = [*before, new]
+    pairs = _overlapping([s.angle_rad for s in everyone], config.overlap_deg)
+    partners = [i for i, j in pairs if j == len(before)]
+    moved = {
+        i: _seen_from(before[i], _thinned(before[i], config.register_points), poses[i])
+        for i in partners
+    }
+    own = _own_information(config)
+    for _ in range(FOLD_ROUNDS):
+        off = _parameters([pose])
+        normal, gradient = np.diag(own), own * (off - guess)
+        for _, block, slope in _equations(moved, config, (partners, new, pose)):
+            normal, gradient = normal + block, gradient - slope
+        step = -np.linalg.solve(normal, gradient)
+        pose = _moved(pose, step)
+        if np.abs(step).max() < SETTLED:
+            break
+    return pose
+
+
 def register_views(
-    surfaces: Sequence[ViewSurface], config: RotationConfig, progress: Progress = no_progress
+    surfaces: Sequence[ViewSurface],
+    config: RotationConfig,
+    progress: Progress = no_progress,
+    so_far: Folded | None = None,
 ) -> list[Float]:
     """Correction of every view, so that views that see the same cloth agree.
 
     Parameters
     ----------
     surfaces : sequence of ViewSurface
-        At least two, in any order.
+        At least two, in the order in which they came.
     config : RotationConfig
+        Its lengths are suited to the views here.
     progress : Progress
+    so_far : Folded, optional
+        Result of fold_in for some of the views, with the same config, made as they came.
 
     Returns
     -------
@@ -121,22 +200,25 @@ def register_views(
     """
     if len(surfaces) < 2:
         raise NotEnoughViews(f"registration: got {len(surfaces)} views, expected 2 or more")
+    poses = list(fold_in(surfaces, config, so_far).poses)
+    config = suited(config, typical([surface.grain for surface in surfaces]))
     pairs = _overlapping([s.angle_rad for s in surfaces], config.overlap_deg)
     partners = [[i for i, j in pairs if j == to] for to in range(len(surfaces))]
     thin = [_thinned(s, config.register_points) for s in surfaces]
-    poses = [np.eye(4) for _ in surfaces]
     prior = _prior(surfaces, config)
     for done in range(config.register_rounds):
         progress("register", done / config.register_rounds)
-        moved = [_seen_from(s, rows, p) for s, rows, p in zip(surfaces, thin, poses, strict=True)]
-        normal, gradient = prior.copy(), prior @ _parameters(poses, len(prior))
-        work = partial(_equations, moved, partners, surfaces, poses, config)
-        for j, equations in enumerate(mapped(work, range(len(surfaces)))):
-            for i, block, slope in equations:
+        placed = zip(surfaces, thin, poses, strict=True)
+        moved = {i: _seen_from(*each) for i, each in enumerate(placed)}
+        off = np.r_[_parameters(poses), np.zeros(AXIS)]  # the axis error is solved anew
+        normal, gradient = prior.copy(), prior @ off
+        equations = partial(_equations, moved, config)
+        for j, found in enumerate(mapped(equations, zip(partners, surfaces, poses, strict=True))):
+            for i, block, slope in found:
                 _add_pair(normal, gradient, i, j, block, slope)
         step = -np.linalg.solve(normal, gradient)[: 6 * len(poses)].reshape(-1, 6)
         poses = [_moved(pose, change) for pose, change in zip(poses, step, strict=True)]
-        if np.abs(step).max() < 2e-5:  # 20 micrometres: far below the noise
+        if np.abs(step).max() < SETTLED:
             break
     return poses
 
@@ -167,29 +249,58 @@ def _thinned(surface: ViewSurface, count: int) -> Int:
 
 
 def _prior(surfaces: Sequence[ViewSurface], config: RotationConfig) -> Float:
-    """Information of the views' motions (6 each) and of the shared error of the axis (4).
+    """Information of the views' motions (6 each) and of the shared error of the axis.
 
-    An axis that is off by (e, d) at angle 0 moves the points of a view at angle a by the rotated
-    -a of it; each view's own motion is what is left after that.
+    Each view's own motion is what is left after that.
     """
-    n = len(surfaces)
-    own = 1 / np.array([np.radians(config.lag_deg)] * 3 + [config.sway_m] * 3) ** 2
-    shared = 1 / np.array([np.radians(config.axis_deg)] * 2 + [config.axis_m] * 2) ** 2
-    information = np.zeros((6 * n + 4, 6 * n + 4))
-    information[6 * n :, 6 * n :] = np.diag(shared)
+    n, own = len(surfaces), _own_information(config)
+    information = np.zeros((6 * n + AXIS, 6 * n + AXIS))
+    information[6 * n :, 6 * n :] = np.diag(_axis_information(config))
     for k, surface in enumerate(surfaces):
-        back = rotation_about(np.array([0.0, 0.0, 1.0]), -surface.angle_rad)[:, :2]
-        effect = np.zeros((6, 4))
-        effect[:3, :2], effect[3:, 2:] = back, back
         row = np.zeros((6, len(information)))
-        row[:, 6 * k : 6 * k + 6], row[:, 6 * n :] = np.eye(6), -effect
+        row[:, 6 * k : 6 * k + 6], row[:, 6 * n :] = np.eye(6), -_effect(surface)
         information += row.T @ (own[:, None] * row)
     return information
 
 
-def _parameters(poses: Sequence[Float], size: int) -> Float:
-    """Rotation vector and shift of each pose, and the axis error that fits them: solved anew."""
-    flat = np.zeros(size)
+def _own_information(config: RotationConfig) -> Float:
+    """(6,) of a view's rotation vector and shift."""
+    return 1 / np.array([np.radians(config.lag_deg)] * 3 + [config.sway_m] * 3) ** 2
+
+
+def _axis_information(config: RotationConfig) -> Float:
+    """(4,) of the axis error: how it leans and where it is, at angle 0."""
+    return 1 / np.array([np.radians(config.axis_deg)] * 2 + [config.axis_m] * 2) ** 2
+
+
+def _effect(surface: ViewSurface) -> Float:
+    """(6, 4) motion of a view by the axis error: one at angle a sees it turned by -a."""
+    back = rotation_about(np.array([0.0, 0.0, 1.0]), -surface.angle_rad)[:, :2]
+    effect = np.zeros((6, AXIS))
+    effect[:3, :2], effect[3:, 2:] = back, back
+    return effect
+
+
+def _axis_error(
+    surfaces: Sequence[ViewSurface], poses: Sequence[Float], config: RotationConfig
+) -> Float:
+    """(4,) axis error that the views' poses tell of."""
+    own, normal, right = (
+        _own_information(config),
+        np.diag(_axis_information(config)),
+        np.zeros(AXIS),
+    )
+    for surface, pose in zip(surfaces, poses, strict=True):
+        effect = _effect(surface)
+        normal += effect.T @ (own[:, None] * effect)
+        right += effect.T @ (own * _parameters([pose]))
+    error: Float = np.linalg.solve(normal, right)
+    return error
+
+
+def _parameters(poses: Sequence[Float]) -> Float:
+    """(6n,) rotation vector and shift of each pose."""
+    flat = np.zeros(6 * len(poses))
     for k, pose in enumerate(poses):
         skew = (pose[:3, :3] - pose[:3, :3].T) / 2  # corrections are a degree or two at most
         flat[6 * k : 6 * k + 3] = skew[2, 1], skew[0, 2], skew[1, 0]
@@ -203,26 +314,31 @@ def _seen_from(surface: ViewSurface, rows: Int, pose: Float) -> tuple[Float, Flo
 
 
 def _equations(
-    moved: Sequence[tuple[Float, Float]],
-    partners: Sequence[Sequence[int]],
-    surfaces: Sequence[ViewSurface],
-    poses: Sequence[Float],
+    moved: Mapping[int, tuple[Float, Float]],
     config: RotationConfig,
-    j: int,
+    of_view: tuple[Sequence[int], ViewSurface, Float],
 ) -> list[tuple[int, Float, Float]]:
-    """Normal equations of the distances of its partners' points from view j's surface.
+    """Normal equations of the distances of its partners' points from a view's surface.
+
+    Parameters
+    ----------
+    moved : mapping of int to (ndarray of shape (n, 3), ndarray of shape (n, 3))
+        Some points of each view, and their normals, in the common frame.
+    config : RotationConfig
+    of_view : (sequence of int, ViewSurface, ndarray of shape (4, 4))
+        Partners, surface and pose.
 
     Returns
     -------
     list of (int, ndarray of shape (6, 6), ndarray of shape (6,))
         Partner, information, gradient.
     """
-    if not partners[j]:
+    partners, surface, pose = of_view
+    if not partners:
         return []
-    owner = np.repeat(partners[j], [len(moved[i][0]) for i in partners[j]])
-    a = np.vstack([moved[i][0] for i in partners[j]])
-    normals_i = np.vstack([moved[i][1] for i in partners[j]])
-    surface, pose = surfaces[j], poses[j]
+    owner = np.repeat(partners, [len(moved[i][0]) for i in partners])
+    a = np.vstack([moved[i][0] for i in partners])
+    normals_i = np.vstack([moved[i][1] for i in partners])
     inside_j = transform_points(inverse(pose), a)
     distance, near = surface.tree.query(inside_j, distance_upper_bound=config.register_reach_m)
     found = np.flatnonzero(np.isfinite(distance))
@@ -235,7 +351,7 @@ def _equations(
     robust = config.noise_m**-2 / (1 + (error / (config.noise_m * 2)) ** 2)
     jacobian = np.hstack([np.cross(a, n), n])
     equations = []
-    for i in partners[j]:
+    for i in partners:
         mine = owner == i
         count = int(mine.sum())
         if count < 10:

@@ -30,7 +30,7 @@ from vflatten_ros.core.joining import agreeing, find_ties, largest_pieces, near_
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.puzzle import overlap as lying_on
 from vflatten_ros.core.ramps import ramps
-from vflatten_ros.core.registration import ViewSurface, register_views, view_surface
+from vflatten_ros.core.registration import Folded, ViewSurface, register_views, view_surface
 from vflatten_ros.core.sheets import Links, link_samples, outward, sheet_edges
 from vflatten_ros.core.sight import PlacedSight, goes_on
 from vflatten_ros.core.slide import neighbours, slide_m
@@ -303,6 +303,7 @@ def fuse_views(
     given: Sequence[Correspondence] = (),
     limits: IntegrationConfig | None = None,
     prints: CorrespondenceConfig | None = None,
+    so_far: Folded | None = None,
 ) -> Fused:
     """Register and fuse the views.
 
@@ -319,27 +320,29 @@ def fuse_views(
     limits : IntegrationConfig, optional
     prints : CorrespondenceConfig, optional
         With it, features of some neighbouring views check the registration.
+    so_far : Folded, optional
+        Result of fold_in for some of the views, made as they arrived.
 
     Raises
     ------
     NotEnoughViews
     """
-    done = prepared or {}
+    done, features = prepared or {}, prints is not None and prints.features
 
     def surface(view: View) -> ViewSurface:
-        return done[view.view_id] if view.view_id in done else view_surface(view, config)
+        return done.get(view.view_id) or view_surface(view, config, features)
 
     progress("surface", 0.0)
     surfaces: list[ViewSurface] = []
     for each in mapped(surface, views):
         surfaces.append(each)
         progress("surface", len(surfaces) / len(views))
+    poses = register_views(surfaces, config, progress, so_far)
     grain = typical([surface.grain for surface in surfaces])
     notices = notices_of(config, grain)
     config = suited(config, grain)
-    poses = register_views(surfaces, config, progress)
     looked = []
-    if prints is not None and prints.features:
+    if prints is not None and features:
         looked = neighbours({view.view_id: view.angle_rad for view in views}, prints.check_pairs)
     named = {i for pair in given for i in (pair.view_a, pair.view_b)}
     named |= {i for pair in looked for i in pair}

@@ -12,8 +12,7 @@ import numpy as np
 
 from vflatten_ros.core.config import CorrespondenceConfig
 from vflatten_ros.core.correspondences import PlacedView
-from vflatten_ros.core.features import common_features, features_of
-from vflatten_ros.core.parallel import mapped
+from vflatten_ros.core.prints import common_features
 from vflatten_ros.core.turntable import TURN
 from vflatten_ros.core.values import Notice
 
@@ -50,9 +49,8 @@ def slide_m(
         Metres; None where too few views have features in common, as on plain fabric.
     """
     off = []
-    features = mapped(features_of, [view for pair in pairs for view in pair])
     for a, b in pairs:
-        found = common_features(a, b, next(features), next(features), config)
+        found = common_features(a, b, config)
         if len(found.a) >= FEWEST_FEATURES:
             shift = np.median(a.points[found.a] - b.points[found.b], axis=0)
             off.append(float(np.linalg.norm(shift)))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.fusion import fuse
+from vflatten_ros.core.fusion import Points, fuse
 
 CONFIG = RotationConfig()
 UP = np.array([0.0, 0.0, 1.0])
@@ -28,7 +29,7 @@ def inner(xyz):
 
 def test_noise_is_averaged_out_and_stated():
     points, view = cloud(0.0)
-    found = fuse(points, np.tile(UP, (len(points), 1)), view, CONFIG)
+    found = fuse(Points(points, np.tile(UP, (len(points), 1)), view), CONFIG)
     height = found.xyz[inner(found.xyz), 2]
     assert height.std() < 0.0003
     assert 0.5 < height.std() / found.sigma_m[inner(found.xyz)].mean() < 2.0
@@ -38,7 +39,7 @@ def test_noise_is_averaged_out_and_stated():
 
 def test_samples_are_about_as_far_apart_as_asked():
     points, view = cloud(0.0)
-    found = fuse(points, np.tile(UP, (len(points), 1)), view, CONFIG)
+    found = fuse(Points(points, np.tile(UP, (len(points), 1)), view), CONFIG)
     per_area = inner(found.xyz).sum() / 0.07**2
     assert 0.7 < per_area * CONFIG.spacing_m**2 < 1.4
 
@@ -47,7 +48,7 @@ def test_two_faces_3_mm_apart_stay_apart():
     front, view = cloud(0.0)
     back, _ = cloud(-0.003, seed=1)
     normals = np.vstack([np.tile(UP, (len(front), 1)), np.tile(-UP, (len(back), 1))])
-    found = fuse(np.vstack([front, back]), normals, np.r_[view, view], CONFIG)
+    found = fuse(Points(np.vstack([front, back]), normals, np.r_[view, view]), CONFIG)
     up = found.normal[:, 2] > 0
     middle = inner(found.xyz)
     assert abs(np.median(found.xyz[middle & up, 2])) < 0.0002
@@ -59,12 +60,22 @@ def test_the_step_between_layers_that_face_alike_stays_a_step():
     high, _ = cloud(0.003, seed=1)
     points = np.vstack([low[low[:, 0] < 0.05], high[high[:, 0] >= 0.05]])
     views = np.r_[view[low[:, 0] < 0.05], view[high[:, 0] >= 0.05]]
-    found = fuse(points, np.tile(UP, (len(points), 1)), views, CONFIG)
+    found = fuse(Points(points, np.tile(UP, (len(points), 1)), views), CONFIG)
     between = inner(found.xyz) & (found.xyz[:, 2] > 0.001) & (found.xyz[:, 2] < 0.002)
     assert between.sum() < 0.03 * inner(found.xyz).sum()
 
 
 def test_sources_are_measured_points_beside_their_samples():
     points, view = cloud(0.0)
-    found = fuse(points, np.tile(UP, (len(points), 1)), view, CONFIG)
+    found = fuse(Points(points, np.tile(UP, (len(points), 1)), view), CONFIG)
     assert np.linalg.norm(points[found.source] - found.xyz, axis=1).max() < 0.006
+
+
+def test_another_draw_has_other_samples_of_the_same_surface():
+    points, view = cloud(0.0)
+    all_points = Points(points, np.tile(UP, (len(points), 1)), view)
+    one, other = (fuse(all_points, CONFIG, shift=shift) for shift in ((0, 0, 0), (0.5, 0.5, 0.5)))
+    assert abs(len(one.xyz) / len(other.xyz) - 1.0) < 0.1
+    away = cKDTree(one.xyz).query(other.xyz[inner(other.xyz)])[0]
+    assert np.median(away) > 0.1 * CONFIG.spacing_m
+    assert other.xyz[inner(other.xyz), 2].std() < 0.0003

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ import pytest
 
 from vflatten_ros.core import hypotheses
 from vflatten_ros.core.config import Config
-from vflatten_ros.core.hypotheses import Tried, settled
+from vflatten_ros.core.hypotheses import Tried, rival, settled
 
 
 def tried(
@@ -63,37 +64,82 @@ def test_a_way_that_fits_nothing_is_the_worst():
 
 def test_one_good_way_settles_it_unless_the_category_or_much_of_the_outline_is_unsure():
     good, unsure, bad = tried(misfit=-0.5), tried(misfit=-0.5, sure=0.9), tried(misfit=0.5)
-    assert settled([good], -0.15)
-    assert not settled([unsure], -0.15) and not settled([tried(unseen=0.2)], -0.15)
-    assert settled([tried(unseen=0.1)], -0.15)
-    assert settled([bad, unsure], -0.15) and settled([unsure, good], -0.15)
-    assert not settled([bad], -0.15) and not settled([bad, bad], -0.15)
-    assert not settled([], -0.15)
+    assert settled([good])
+    assert not settled([unsure]) and not settled([tried(unseen=0.2)])
+    assert settled([tried(unseen=0.1)])
+    assert settled([bad, unsure]) and settled([unsure, good])
+    assert not settled([bad]) and not settled([bad, bad])
+    assert not settled([])
+
+
+def test_ways_that_disagree_settle_it_only_if_one_is_much_better():
+    good, other = tried(misfit=-0.3), tried(misfit=0.6, category="skirt")
+    assert settled([good, tried(misfit=0.6)]) and not settled([good, other])
+    assert settled([tried(misfit=-0.6), other])
+    assert settled([good, tried(misfit=1.5, category="skirt")])  # no rival: far worse
+    assert settled([good, tried(misfit=0.6, category="unknown")])
 
 
 def test_a_bad_way_and_a_near_tie_of_categories_are_not_to_be_trusted():
     assert not tried().untrusted and not tried(sure=0.75).untrusted
     assert "does not lie flat" in tried(overlap=0.2).untrusted
     assert "60% likely" in tried(sure=0.6, misfit=-0.9).untrusted
+    near, farther = tried(misfit=-0.4, category="skirt"), tried(misfit=-0.3, category="skirt")
+    assert rival([tried(), near, farther], 0.15) == "skirt"
+    assert rival([tried(), farther, tried(misfit=-0.4, category="unknown")], 0.15) == ""
+    assert "nearly as good a skirt" in dataclasses.replace(tried(), rival="skirt").untrusted
 
 
 @dataclass(frozen=True)
 class Linked:
+    draw: int
     doubt: float = 0.0
+
+
+@pytest.fixture
+def method(monkeypatch):
+    """The stages replaced by notes of what they were called with."""
+    noted = SimpleNamespace(ramps=[], found=[], drawn=[], misfit={})
+
+    def drawn_again(fused, draw, *_):
+        noted.drawn.append(draw)
+        return draw
+
+    def recognised(surface, *_):
+        noted.found.append(surface)
+        return tried(misfit=noted.misfit.get(surface.draw, 0.5))
+
+    monkeypatch.setattr(hypotheses, "drawn_again", drawn_again)
+    monkeypatch.setattr(hypotheses, "link_surface", lambda fused, *_: Linked(fused))
+    monkeypatch.setattr(hypotheses, "doubts", lambda *_: noted.ramps.append(1) or 2.0)
+    monkeypatch.setattr(hypotheses, "unfold_surface", lambda surface, *_: surface)
+    monkeypatch.setattr(hypotheses, "_recognised", recognised)
+    return noted
+
+
+def ways(*draws_and_doubts):
+    return tuple((draw, hypotheses.WHOLE, doubt) for draw, doubt in draws_and_doubts)
 
 
 @pytest.mark.parametrize(("misfit", "looked"), [(-0.5, 0), (0.5, 1)])
 def test_ramps_are_looked_for_once_and_only_where_the_first_way_does_not_settle_it(
-    monkeypatch, misfit, looked
+    monkeypatch, method, misfit, looked
 ):
-    made, found = [], []
-    monkeypatch.setattr(hypotheses, "link_surface", lambda *_: Linked())
-    monkeypatch.setattr(hypotheses, "doubts", lambda *_: made.append(1) or 2.0)
-    monkeypatch.setattr(hypotheses, "unfold_surface", lambda surface, *_: found.append(surface))
-    monkeypatch.setattr(hypotheses, "_recognised", lambda *_: tried(misfit=misfit))
-    whole = [way for way in hypotheses.WAYS if way[0] == hypotheses.WHOLE]
-    monkeypatch.setattr(hypotheses, "WAYS", (*whole, whole[-1]))
-    hypotheses.likeliest(None, (), Config(), lambda *_: None)
-    assert len(made) == looked
-    assert [surface.doubt for surface in found] == [0.0, 2.0, 2.0][: len(found)]
-    assert len(found) == 1 + 2 * looked
+    method.misfit = {0: misfit}
+    monkeypatch.setattr(hypotheses, "WAYS", ways((0, np.inf), (0, 1.0), (0, 0.4)))
+    hypotheses.likeliest(0, (), Config(), lambda *_: None)
+    assert len(method.ramps) == looked
+    assert [surface.doubt for surface in method.found] == [0.0, 2.0, 2.0][: len(method.found)]
+    assert len(method.found) == 1 + 2 * looked
+
+
+def test_samples_are_drawn_again_once_and_only_where_those_before_do_not_settle_it(
+    monkeypatch, method
+):
+    method.misfit = {0: 0.5, 1: 0.1, 2: -0.5}
+    three = ways((0, np.inf), (1, np.inf), (1, 1.0), (2, np.inf), (3, np.inf))
+    monkeypatch.setattr(hypotheses, "WAYS", three)
+    best = hypotheses.likeliest(0, (), Config(), lambda *_: None)
+    assert method.drawn == [1, 2]
+    assert [surface.draw for surface in method.found] == [0, 1, 1, 2]
+    assert best.found.fit.misfit == -0.5

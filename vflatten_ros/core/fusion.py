@@ -8,6 +8,7 @@ fit settles: the other layer drops out instead of being averaged in.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,6 +22,21 @@ NEIGHBOURS, RADIUS_M, LEAST = 64, 0.007, 12  # most points for a fit of this rad
 CHUNK = 1024  # samples fitted at a time: they stay in the cache
 BANDS = (3.0, 2.0, 1.5)  # height (Gaussian) of the successive fits, in standard deviations
 MIN_CELL = 3  # points that make a sample
+NO_SHIFT = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Registered points of all views, common frame."""
+
+    xyz: Float  # (n, 3)
+    normal: Float  # (n, 3) unit, outwards
+    view: Int  # (n,) which view each comes from, from 0
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of xyz."""
+        return cKDTree(self.xyz, balanced_tree=False, compact_nodes=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,32 +51,30 @@ class Samples:
 
 
 def fuse(
-    points: Float,
-    normals: Float,
-    view: Int,
+    points: Points,
     config: RotationConfig,
     progress: Progress = no_progress,
+    shift: tuple[float, float, float] = NO_SHIFT,
 ) -> Samples:
     """Samples about `spacing_m` apart on every layer that any view saw.
 
     Parameters
     ----------
-    points, normals : ndarray of shape (n, 3)
-        Registered points of all views and their outward normals, common frame.
-    view : ndarray of shape (n,)
-        Which view each point comes from, from 0.
+    points : Points
     config : RotationConfig
     progress : Progress
+    shift : (float, float, float)
+        Of the grid that the samples begin from, in its cells: another draw of the same surface.
     """
     progress("fuse", 0.0)
-    start, direction = _cells(points, normals, config.spacing_m)
-    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    start, direction = _cells(points, config.spacing_m, np.array(shift))
     firsts = range(0, len(start), CHUNK)
 
     def fitted(first: int) -> tuple[Float, Float, Float, Int, Bool]:
         some = slice(first, first + CHUNK)
-        return _fit(start[some], direction[some], points, normals, view, tree, config)
+        return _fit(start[some], direction[some], points, config)
 
+    _ = points.tree  # made once, before the threads ask for it
     parts = []
     for part in mapped(fitted, firsts):
         parts.append(part)
@@ -71,17 +85,16 @@ def fuse(
     return Samples(xyz[keep], normal[keep], sigma[keep], source[keep], seen[keep])
 
 
-def _cells(points: Float, normals: Float, size_m: float) -> tuple[Float, Float]:
+def _cells(points: Points, size_m: float, shift: Float) -> tuple[Float, Float]:
     """Mean point and normal of each cube and direction (of six) that holds enough points."""
+    xyz, normals = points.xyz, points.normal
     lead = np.abs(normals).argmax(1)
     sign = normals[np.arange(len(normals)), lead] > 0
-    grid = np.floor((points - points.min(0)) / size_m).astype(np.int64)
+    grid = np.floor((xyz - xyz.min(0)) / size_m + shift).astype(np.int64)
     extent = grid.max(0) + 1
     key = ((grid[:, 0] * extent[1] + grid[:, 1]) * extent[2] + grid[:, 2]) * 6 + 2 * lead + sign
     _, cell, count = np.unique(key, return_inverse=True, return_counts=True)
-    sums = np.stack(
-        [np.bincount(cell, column) for column in np.hstack([points, normals]).T], axis=1
-    )
+    sums = np.stack([np.bincount(cell, column) for column in np.hstack([xyz, normals]).T], axis=1)
     sums = sums[count >= MIN_CELL] / count[count >= MIN_CELL, None]
     direction = sums[:, 3:] / np.linalg.norm(sums[:, 3:], axis=1, keepdims=True)
     return sums[:, :3], direction
@@ -90,21 +103,18 @@ def _cells(points: Float, normals: Float, size_m: float) -> tuple[Float, Float]:
 def _fit(
     at: Float,
     normal: Float,
-    points: Float,
-    normals: Float,
-    view: Int,
-    tree: cKDTree,
+    points: Points,
     config: RotationConfig,
 ) -> tuple[Float, Float, Float, Int, Bool]:
     """Move samples onto their own layer by local fits: planes first, a quadric last."""
     radius, start = config.fit_m, at
     most = max(LEAST, round(NEIGHBOURS * (radius / RADIUS_M) ** 2))
-    distance, near = tree.query(at, k=most, distance_upper_bound=radius * 1.2)
+    distance, near = points.tree.query(at, k=most, distance_upper_bound=radius * 1.2)
     found = np.isfinite(distance)
     near = np.where(found, near, 0)
     # a nanometre in a centimetre is enough: half the memory to go through
-    around = (points[near] - start[:, None]).astype(np.float32)
-    their_normals = normals[near].astype(np.float32)
+    around = (points.xyz[near] - start[:, None]).astype(np.float32)
+    their_normals = points.normal[near].astype(np.float32)
     for band in BANDS:
         e1, e2 = tangents(normal)
         frame = np.stack([e1, e2, normal], axis=-1).astype(np.float32)
@@ -130,9 +140,9 @@ def _fit(
     nearest = inside.argmin(1)
     rows = np.arange(len(at))
     source = np.where(np.isfinite(inside[rows, nearest]), near[rows, nearest], -1)
-    seen = np.zeros((len(at), int(view.max()) + 1), dtype=bool)
+    seen = np.zeros((len(at), int(points.view.max()) + 1), dtype=bool)
     row, column = np.nonzero(weight > 0.3)
-    seen[row, view[near[row, column]]] = True
+    seen[row, points.view[near[row, column]]] = True
     return at, normal, sigma, source.astype(np.int64), seen
 
 

@@ -29,6 +29,7 @@ from vflatten_ros.core.rotation import (
     Surface,
     Unfolded,
     doubts,
+    drawn_again,
     link_surface,
     unfold_surface,
 )
@@ -36,13 +37,20 @@ from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import Progress
 
 WHOLE = "whole"
-WAYS = (  # how, greatest doubt, badness of what was tried before below which it is left out
-    (WHOLE, np.inf, -np.inf),
-    (PUZZLE, 1.0, -0.05),
-    (WHOLE, 1.0, 0.05),
-    (CLOSED, 1.0, 0.05),
-    (PUZZLE, 0.4, 0.05),
+WAYS = (  # draw of the samples, how, greatest doubt
+    (0, WHOLE, np.inf),
+    (0, PUZZLE, 1.0),
+    (1, WHOLE, np.inf),
+    (1, PUZZLE, 1.0),
+    (0, PUZZLE, 0.4),
+    (1, PUZZLE, 0.4),
+    (0, CLOSED, 1.0),
+    (1, CLOSED, 1.0),
 )
+ENOUGH = -0.05  # badness below which no further way is tried
+DISPUTED = -0.5  # the same where another way that is not much worse has another category
+RIVAL = 1.5  # how much worse it may be
+NEAR_TIE = 0.15  # by how much, for the result not to be trusted
 SURE = 0.97  # probability of a category below which one way alone is not believed
 MOST_UNSEEN = 0.15  # share of the outline that no view shows, above which it is not, either
 DOUBTFUL = 0.3  # badness above which a result is not to be trusted
@@ -63,6 +71,7 @@ class Tried:
     unfolded: Unfolded
     found: Recognition
     aside: float = 0.0  # share of the samples in large groups that were left out
+    rival: str = ""  # another category that is nearly as good in another way
 
     @property
     def badness(self) -> float:
@@ -93,6 +102,8 @@ class Tried:
             return f"no category fits the item well, or it does not lie flat ({self.badness:.1f})"
         if self.sure < UNSURE:
             return f"it is only {self.sure:.0%} likely to be what it most looks like"
+        if self.rival:
+            return f"laid flat in another way it is nearly as good a {self.rival}"
         return ""
 
 
@@ -111,33 +122,48 @@ def likeliest(
     """
     tries: list[Tried] = []
     failures: list[DisconnectedSurface] = []
-    ways = _Ways(fused, templates, config, progress)
-    for how, doubt, enough in WAYS:
-        if settled(tries, enough):
+    draws: dict[int, _Draw] = {}
+    for draw, how, doubt in WAYS:
+        if settled(tries):
             break
+        if draw not in draws:
+            again = drawn_again(fused, draw, config.rotation, progress) if draw else fused
+            draws[draw] = _Draw(again, templates, config, progress)
         try:
-            tries.append(ways.tried(how, doubt))
+            tries.append(draws[draw].tried(how, doubt))
         except DisconnectedSurface as error:
             failures.append(error)
     if not tries:
         raise failures[0]
-    return _best(tries)
+    return replace(_best(tries), rival=rival(tries, NEAR_TIE))
 
 
-def settled(tries: Sequence[Tried], enough: float) -> bool:
-    """Whether what was tried is good enough: below a badness, and one way alone beyond doubt."""
-    if not tries or _best(tries).badness >= enough:
+def settled(tries: Sequence[Tried]) -> bool:
+    """Whether what was tried is good enough, undisputed, and one way alone beyond doubt."""
+    if not tries:
+        return False
+    enough = DISPUTED if rival(tries, RIVAL) else ENOUGH
+    if _best(tries).badness >= enough:
         return False
     unseen = float(tries[0].unfolded.outline.inferred.mean())
     return len(tries) > 1 or (tries[0].sure >= SURE and unseen < MOST_UNSEEN)
+
+
+def rival(tries: Sequence[Tried], margin: float) -> str:
+    """Another category than the best way's, of a way that is less than a margin worse; or none."""
+    best = _best(tries)
+    known = (UNKNOWN, best.found.category)
+    others = [one for one in tries if one.found.category not in known]
+    near = [one for one in others if one.badness < best.badness + margin]
+    return _best(near).found.category if near else ""
 
 
 def _best(tries: Sequence[Tried]) -> Tried:
     return min(tries, key=lambda tried: tried.badness)
 
 
-class _Ways:
-    """The ways, with what several of them need."""
+class _Draw:
+    """The ways with one draw of the samples, and what several of them need."""
 
     def __init__(
         self,

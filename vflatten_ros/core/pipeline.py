@@ -169,7 +169,11 @@ def _rotation(
         found = recognise_again(
             found, unfolded.outline, unfolded.points, tuple(templates), config.recognition
         )
-    best = replace(best, found=replace(best.found, probabilities=found.probabilities))
+    best = replace(
+        best,
+        found=replace(best.found, probabilities=found.probabilities),
+        rival="" if best.rival == found.category else best.rival,  # weighed again, it won
+    )
     none = np.zeros(0)
     notices = told + unfolded.notices
     if best.untrusted:

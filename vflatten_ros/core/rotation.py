@@ -17,7 +17,7 @@ from vflatten_ros.core.config import CorrespondenceConfig, IntegrationConfig, Ro
 from vflatten_ros.core.correspondences import NOTHING_GIVEN, Judged, judged, place_view
 from vflatten_ros.core.distances import Distances, Steps, link_steps, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
-from vflatten_ros.core.fusion import Samples, fuse
+from vflatten_ros.core.fusion import Points, Samples, fuse
 from vflatten_ros.core.geometry import (
     loop_normals,
     thinned_loop,
@@ -73,6 +73,7 @@ CUT_M = 0.008  # between points of one slit
 DEEP_M = 0.020  # how deep within the outline a slit lies, by the middle of its points
 SLIT_M = 0.03  # widest slit of which one side tells what the other is
 RIM_LAID_M = 0.015  # between the two sides of a rim that lies flat as one
+DRAWS = (0.8191725, 0.6710436, 0.5497005)  # steps of a grid's shift that spread evenly in a cube
 CELL_M = 0.002  # of the image whose contour is the outline
 
 
@@ -81,14 +82,23 @@ class Fused:
     """Samples of the whole visible surface."""
 
     samples: Samples
-    points: Float  # (m, 3) registered points of all views that the samples were fitted to
-    normals: Float  # (m, 3)
-    view_id: Int  # (n,) of the measured point nearest to each sample
-    pixel: Int  # (n, 2)
+    points: Points  # that the samples were fitted to
+    point_view_id: Int  # (m,)
+    point_pixel: Int  # (m, 2)
     grain: Grain  # of the points, median of the views
     sights: tuple[PlacedSight, ...] = ()  # none: whether cloth goes on is told by the samples
     given: Judged = NOTHING_GIVEN  # corresponding points
     notices: tuple[Notice, ...] = ()
+
+    @property
+    def view_id(self) -> Int:
+        """(n,) of the measured point nearest to each sample."""
+        return self.point_view_id[self.samples.source]
+
+    @property
+    def pixel(self) -> Int:
+        """(n, 2) of that point."""
+        return self.point_pixel[self.samples.source]
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,19 +361,17 @@ def fuse_views(
         for view, surface, pose in zip(views, surfaces, poses, strict=True)
         if view.view_id in named
     }
-    moved = zip(poses, surfaces, strict=True)
-    points = np.vstack([transform_points(pose, s.points) for pose, s in moved])
-    moved = zip(poses, surfaces, strict=True)
-    normals = np.vstack([transform_directions(pose, s.normals) for pose, s in moved])
-    of_point = np.concatenate([np.full(len(s.points), k) for k, s in enumerate(surfaces)])
-    row = np.concatenate([s.index for s in surfaces])
-    samples = fuse(points, normals, of_point, config, progress)
-    of_view = of_point[samples.source]
-    pixel = np.zeros((len(of_view), 2), dtype=np.int64)
-    for k, view in enumerate(views):
-        mine = of_view == k
-        pixel[mine] = view.pixel[row[samples.source[mine]]]
-    ids = np.array([view.view_id for view in views], dtype=np.int64)
+    count = [len(surface.points) for surface in surfaces]
+    placed_points = zip(poses, surfaces, strict=True)
+    placed_normals = zip(poses, surfaces, strict=True)
+    points = Points(
+        xyz=np.vstack([transform_points(pose, s.points) for pose, s in placed_points]),
+        normal=np.vstack([transform_directions(pose, s.normals) for pose, s in placed_normals]),
+        view=np.repeat(np.arange(len(surfaces)), count),
+    )
+    point_view_id = np.repeat(np.array([view.view_id for view in views], dtype=np.int64), count)
+    point_pixel = np.vstack([v.pixel[s.index] for v, s in zip(views, surfaces, strict=True)])
+    samples = fuse(points, config, progress)
     slid = None
     if prints is not None and looked:
         progress("fuse", 0.9)
@@ -376,7 +384,21 @@ def fuse_views(
         for surface, pose in zip(surfaces, poses, strict=True)
         if surface.sight is not None
     )
-    return Fused(samples, points, normals, ids[of_view], pixel, grain, sights, checked, notices)
+    return Fused(samples, points, point_view_id, point_pixel, grain, sights, checked, notices)
+
+
+def drawn_again(fused: Fused, draw: int, config: RotationConfig, progress: Progress) -> Fused:
+    """The same points with other samples: where layers touch, what joins them hangs on a hair.
+
+    Parameters
+    ----------
+    fused : Fused
+    draw : int
+        Which, from 1; 0 are the samples of fuse_views.
+    """
+    x, y, z = (draw * np.array(DRAWS)) % 1.0
+    samples = fuse(fused.points, config, progress, (float(x), float(y), float(z)))
+    return replace(fused, samples=samples)
 
 
 def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Surface:
@@ -413,8 +435,8 @@ def _told(fused: Fused, config: RotationConfig) -> tuple[Int, Int]:
 
 def doubts(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Float:
     """How likely each sample (n,) joins two layers: above 1, it may."""
-    samples = fused.samples
-    return ramps(samples.xyz, samples.normal, fused.points, fused.normals, config, progress)
+    samples, points = fused.samples, fused.points
+    return ramps(samples.xyz, samples.normal, points.xyz, points.normal, config, progress)
 
 
 def _edges(

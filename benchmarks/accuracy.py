@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 """How far results are from the truth of simulated recordings: writes docs/accuracy.md.
 
-    accuracy.py [FOLDER ...] [--runs rotation,protocol,chosen,calibration] [--output FILE]
+    accuracy.py [FOLDER ...] [--runs rotation,protocol,...] [--output FILE]
 
 Each FOLDER is a recording with truth.json and truth.npz, or holds such recordings (default: bags/).
 Every recording is flattened with all views and no manual input (rotation), by the paper's protocol
-(protocol), by the paper's method with views and points chosen by itself (chosen), and with all
-views and a calibration that is off (calibration). The truth is read only after the result is there,
-to compare.
+(protocol), by the paper's method with views and points chosen by itself (chosen), with all views
+and a calibration that is off (calibration), and with all views and other samples (drawn). The truth
+is read only after the result is there, to compare.
 """
 
 # ruff: noqa: E402  (threads must be limited before numpy is imported)
@@ -50,7 +50,9 @@ RUNS = {
     "protocol": "The paper's protocol: two views, three to five points (`method: kita2019`)",
     "chosen": "The paper's method, views and points chosen by itself (`method: kita2019`)",
     "calibration": "All views, the calibrated axis 3 mm and 0.5 degrees off",
+    "drawn": "All views, other samples of the same surface (`rotation.draw`)",
 }
+DRAWN = 4  # none of the draws that the method takes
 USUAL_M = 1.4  # from the rig to the wrist's axis, at most
 FAILED_SIZE_PCT = 7.0  # a size further off than this is drawn
 
@@ -137,6 +139,10 @@ def compare(folder: Path, run: str, pictures: Path) -> Row | None:
     config = dataclasses.replace(
         Config(), method="kita2019" if run in ("protocol", "chosen") else "rotation"
     )
+    if run == "drawn":
+        config = dataclasses.replace(
+            config, rotation=dataclasses.replace(config.rotation, draw=DRAWN)
+        )
     started = time.perf_counter()
     result: dict[str, Any] = {}
     notes: list[str] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -74,7 +76,9 @@ def test_sources_are_measured_points_beside_their_samples():
 def test_another_draw_has_other_samples_of_the_same_surface():
     points, view = cloud(0.0)
     all_points = Points(points, np.tile(UP, (len(points), 1)), view)
-    one, other = (fuse(all_points, CONFIG, shift=shift) for shift in ((0, 0, 0), (0.5, 0.5, 0.5)))
+    one, other = (fuse(all_points, CONFIG, draw=draw) for draw in (0, 1))
+    set_so = fuse(all_points, replace(CONFIG, draw=1))
+    np.testing.assert_array_equal(set_so.xyz, other.xyz)
     assert abs(len(one.xyz) / len(other.xyz) - 1.0) < 0.1
     away = cKDTree(one.xyz).query(other.xyz[inner(other.xyz)])[0]
     assert np.median(away) > 0.1 * CONFIG.spacing_m

@@ -571,6 +571,12 @@ class RotationConfig(Checked):
     rim_length_m: float = option(
         0.12, "Length of rim that must agree for two pieces to be joined, m.", low=0.02, high=10.0
     )
+    draw: int = option(
+        0,
+        "Which samples of the surface to begin with, of many alike; others show what is chance.",
+        low=0,
+        high=100000,
+    )
     landmarks: int = option(300, "Samples whose mutual distances are unfolded.", low=50, high=5000)
     local_m: float = option(
         0.25, "Nearer pairs on one sheet keep their distance both ways, m.", low=0.01, high=2.0

@@ -22,7 +22,7 @@ NEIGHBOURS, RADIUS_M, LEAST = 64, 0.007, 12  # most points for a fit of this rad
 CHUNK = 1024  # samples fitted at a time: they stay in the cache
 BANDS = (3.0, 2.0, 1.5)  # height (Gaussian) of the successive fits, in standard deviations
 MIN_CELL = 3  # points that make a sample
-NO_SHIFT = (0.0, 0.0, 0.0)
+DRAW = np.array([0.8191725, 0.6710436, 0.5497005])  # steps that fill a cube evenly, in cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def fuse(
     points: Points,
     config: RotationConfig,
     progress: Progress = no_progress,
-    shift: tuple[float, float, float] = NO_SHIFT,
+    draw: int = 0,
 ) -> Samples:
     """Samples about `spacing_m` apart on every layer that any view saw.
 
@@ -63,11 +63,11 @@ def fuse(
     points : Points
     config : RotationConfig
     progress : Progress
-    shift : (float, float, float)
-        Of the grid that the samples begin from, in its cells: another draw of the same surface.
+    draw : int
+        Added to rotation.draw: another has its grid shifted, and other samples of the surface.
     """
     progress("fuse", 0.0)
-    start, direction = _cells(points, config.spacing_m, np.array(shift))
+    start, direction = _cells(points, config.spacing_m, ((config.draw + draw) * DRAW) % 1.0)
     firsts = range(0, len(start), CHUNK)
 
     def fitted(first: int) -> tuple[Float, Float, Float, Int, Bool]:
@@ -86,7 +86,16 @@ def fuse(
 
 
 def _cells(points: Points, size_m: float, shift: Float) -> tuple[Float, Float]:
-    """Mean point and normal of each cube and direction (of six) that holds enough points."""
+    """Mean point and normal of each cube and direction (of six) that holds enough points.
+
+    Parameters
+    ----------
+    points : Points
+    size_m : float
+        Of the cubes.
+    shift : ndarray of shape (3,)
+        Of their grid, in cubes.
+    """
     xyz, normals = points.xyz, points.normal
     lead = np.abs(normals).argmax(1)
     sign = normals[np.arange(len(normals)), lead] > 0

@@ -73,7 +73,6 @@ CUT_M = 0.008  # between points of one slit
 DEEP_M = 0.020  # how deep within the outline a slit lies, by the middle of its points
 SLIT_M = 0.03  # widest slit of which one side tells what the other is
 RIM_LAID_M = 0.015  # between the two sides of a rim that lies flat as one
-DRAWS = (0.8191725, 0.6710436, 0.5497005)  # steps of a grid's shift that spread evenly in a cube
 CELL_M = 0.002  # of the image whose contour is the outline
 
 
@@ -393,12 +392,10 @@ def drawn_again(fused: Fused, draw: int, config: RotationConfig, progress: Progr
     Parameters
     ----------
     fused : Fused
+        Result of fuse_views, which has draw 0.
     draw : int
-        Which, from 1; 0 are the samples of fuse_views.
     """
-    x, y, z = (draw * np.array(DRAWS)) % 1.0
-    samples = fuse(fused.points, config, progress, (float(x), float(y), float(z)))
-    return replace(fused, samples=samples)
+    return replace(fused, samples=fuse(fused.points, config, progress, draw))
 
 
 def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Surface:

@@ -63,7 +63,7 @@ def test_a_way_that_fits_nothing_is_the_worst():
 
 
 def test_one_good_way_settles_it_unless_the_category_or_much_of_the_outline_is_unsure():
-    good, unsure, bad = tried(misfit=-0.5), tried(misfit=-0.5, sure=0.9), tried(misfit=0.5)
+    good, unsure, bad = tried(misfit=-0.5), tried(misfit=-0.5, sure=0.95), tried(misfit=0.5)
     assert settled([good])
     assert not settled([unsure]) and not settled([tried(unseen=0.2)])
     assert settled([tried(unseen=0.1)])
@@ -78,6 +78,8 @@ def test_ways_that_disagree_settle_it_only_if_one_is_much_better():
     assert settled([tried(misfit=-0.6), other])
     assert settled([good, tried(misfit=1.5, category="skirt")])  # no rival: far worse
     assert settled([good, tried(misfit=0.6, category="unknown")])
+    assert not settled([tried(misfit=-0.4, sure=0.85), tried(misfit=0.6)])
+    assert settled([tried(misfit=-0.7, sure=0.85), tried(misfit=0.6)])
 
 
 def test_a_bad_way_and_a_near_tie_of_categories_are_not_to_be_trusted():

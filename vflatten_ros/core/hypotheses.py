@@ -48,8 +48,9 @@ WAYS = (  # draw of the samples, how, greatest doubt
     (1, CLOSED, 1.0),
 )
 ENOUGH = -0.05  # badness below which no further way is tried
-DISPUTED = -0.5  # the same where another way that is not much worse has another category
+DISPUTED = -0.5  # the same if it is unsure, or another way not much worse has another category
 RIVAL = 1.5  # how much worse it may be
+UNDECIDED = 0.9  # probability of the best way's category below which it is unsure
 NEAR_TIE = 0.15  # by how much, for the result not to be trusted
 SURE = 0.97  # probability of a category below which one way alone is not believed
 MOST_UNSEEN = 0.15  # share of the outline that no view shows, above which it is not, either
@@ -142,8 +143,9 @@ def settled(tries: Sequence[Tried]) -> bool:
     """Whether what was tried is good enough, undisputed, and one way alone beyond doubt."""
     if not tries:
         return False
-    enough = DISPUTED if rival(tries, RIVAL) else ENOUGH
-    if _best(tries).badness >= enough:
+    best = _best(tries)
+    disputed = bool(rival(tries, RIVAL)) or best.sure < UNDECIDED
+    if best.badness >= (DISPUTED if disputed else ENOUGH):
         return False
     unseen = float(tries[0].unfolded.outline.inferred.mean())
     return len(tries) > 1 or (tries[0].sure >= SURE and unseen < MOST_UNSEEN)

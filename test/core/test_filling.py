@@ -8,7 +8,7 @@ from flat import lying_at
 
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import RecognitionConfig
-from vflatten_ros.core.filling import filled
+from vflatten_ros.core.filling import DEEP_M, deep_inside_m, filled
 from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.recognition import recognise
 from vflatten_ros.core.values import Outline
@@ -74,3 +74,15 @@ def test_where_the_cloth_was_seen_to_end_nothing_is_added():
     assert (
         area(filled(elsewhere, fit_of(elsewhere, points))) < WIDTH_M * LENGTH_M - 0.8 * NOTCH_M**2
     )
+
+
+@pytest.mark.parametrize("start", [0, 40, 180])
+def test_how_much_of_a_seen_outline_the_category_leaves_inside(start):
+    outline, points = notched()
+    fit = fit_of(outline, points)
+    assert deep_inside_m(outline, fit) == 0.0  # no view shows it
+    shown, _ = notched(inferred_sides=())
+    turned = Outline(
+        *(np.roll(x, start, axis=0) for x in (shown.uv, shown.sigma_m, shown.inferred))
+    )
+    assert deep_inside_m(turned, fit) == pytest.approx(2 * (NOTCH_M - DEEP_M), abs=0.012)

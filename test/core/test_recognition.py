@@ -91,6 +91,18 @@ def test_sizes_tell_shorts_from_trousers_once_the_legs_lie_right():
         assert inseam == pytest.approx(length_m, rel=0.05)
 
 
+def test_what_was_taken_for_an_item_without_parts_is_recognised_anew():
+    """The slit between legs that lay together came out when the surface settled."""
+    config = RecognitionConfig()
+    closed = drawn([[0, 0], [0.34, 0], [0.36, 0.38], [-0.02, 0.38]])
+    before = recognise(*closed, TEMPLATES, config)
+    assert before.category == "skirt"
+    legs = [[0, 0], [0.16, 0], [0.17, 0.18], [0.18, 0], [0.34, 0], [0.36, 0.38], [-0.02, 0.38]]
+    again = recognise_again(before, *drawn(legs), TEMPLATES, config)
+    assert again.category == "shorts" and again.fit.template.parts
+    assert recognise_again(before, *closed, TEMPLATES, config).category == "skirt"
+
+
 def test_a_category_that_was_out_of_the_question_does_not_come_back():
     config = RecognitionConfig()
     before = recognise(*two_legs(0.2), TEMPLATES, config)

@@ -1,4 +1,4 @@
-"""The outline where no view shows it: as the category has it."""
+"""The outline beside the category's: filled where no view shows it, and odd where it was seen."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from vflatten_ros.core.values import Float, Outline
 CELL_M = 0.002  # of the images
 SAME_M = 0.004  # between the outline before and after where it stays as it is
 THINNEST_CELLS = 3  # of what is added
+DEEP_M = 0.04  # inside the category's outline, which is no mere inaccuracy
+MOST_DEEP_M = 0.13  # longest stretch seen there of results that turned out right: 0.123
 
 
 def filled(outline: Outline, fit: Fit) -> Outline:
@@ -61,6 +63,31 @@ def filled(outline: Outline, fit: Fit) -> Outline:
         np.where(added, np.hypot(sigma, outline.sigma_m[near]), outline.sigma_m[near]),
         added | outline.inferred[near],
     )
+
+
+def deep_inside_m(outline: Outline, fit: Fit) -> float:
+    """Length of the longest seen stretch of the outline that lies deep inside the category's.
+
+    Parameters
+    ----------
+    outline : Outline
+    fit : Fit
+
+    Returns
+    -------
+    float
+        Metres; above MOST_DEEP_M the category does not say what was seen there.
+    """
+    category = (fit.points()[: fit.template.vertices] * 1e3).astype(np.float32)
+    off = [cv2.pointPolygonTest(category, (u, v), True) for u, v in (outline.uv * 1e3).tolist()]
+    odd = (np.array(off) > 1e3 * DEEP_M) & ~outline.inferred
+    if odd.all() or not odd.any():
+        return 0.0 if not odd.any() else float("inf")
+    length = np.linalg.norm(np.roll(outline.uv, -1, axis=0) - outline.uv, axis=1)
+    first = int(np.flatnonzero(~odd)[0])  # begin where no stretch goes on
+    odd, length = np.roll(odd, -first), np.roll(length, -first)
+    stretch = np.cumsum(~odd)
+    return float(np.bincount(stretch[odd], length[odd]).max())
 
 
 def _image(uv: Float, low: Float, shape: tuple[int, int]) -> NDArray[np.uint8]:

@@ -62,7 +62,8 @@ EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's
 ASIDE = 3.0  # of the share that is left out in large groups, beside: it can be no noise
 WORTH_PLACING = 0.1  # share of the samples of a group
 HOPELESS = 0.8  # misfit of the largest group, above which none is: that group is laid out wrong
-PLACED_WAYS = 2  # categories by which groups are placed that are looked at
+PLACED_WAYS = 2  # categories by which groups are placed that are looked at, if they are as likely
+LEAST_ODDS = 1e-3  # as this, against the likeliest
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +217,8 @@ class _Draw:
         odds = {p.template.category: float(np.exp(least - p.cost)) for p in placings}
         tries = [alone]
         for placing in placings[:PLACED_WAYS]:
+            if odds[placing.template.category] < LEAST_ODDS:
+                break
             sigma_m = config.assembly.sigma_m
             beside = put_beside(laid, placing.motions, sigma_m, config.rotation)
             only = tuple(t for t in self._templates if t.category == placing.template.category)

@@ -11,7 +11,7 @@ from vflatten_ros.core.assembly import assemble
 from vflatten_ros.core.automatic_pair import fill_up, flatten_best_pair
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
-from vflatten_ros.core.filling import filled
+from vflatten_ros.core.filling import MOST_DEEP_M, deep_inside_m, filled
 from vflatten_ros.core.grain import suited
 from vflatten_ros.core.hypotheses import likeliest
 from vflatten_ros.core.measurement import measure
@@ -37,6 +37,7 @@ from vflatten_ros.core.values import (
     Flattened,
     GeodesicLines,
     Notice,
+    Outline,
     Progress,
     View,
     no_progress,
@@ -156,8 +157,9 @@ def _rotation(
     best = likeliest(fused, tuple(templates), config, progress)
     del fused  # its points are many
     unfolded, found = best.unfolded, best.found
-    for turn in range(TURNS if found.category != UNKNOWN else 0):
-        progress("parts", turn / TURNS)
+    turn, turns = 0, TURNS if found.category != UNKNOWN else 0
+    while turn < turns:
+        progress("parts", turn / turns)
         fit = found.fits[found.category]
         rest = place(fit.template, fit.pose, fit.template.at_rest(fit.state))[0]
         k = fit.template.vertices
@@ -165,10 +167,13 @@ def _rotation(
         if turn and np.abs(swung - rest[:k]).max() < AT_REST_M:
             break
         unfolded = turn_parts(unfolded, swung, rest[:k], config.rotation)
-        progress("parts", (turn + 0.6) / TURNS)
+        progress("parts", (turn + 0.6) / turns)
         found = recognise_again(
             found, unfolded.outline, unfolded.points, tuple(templates), config.recognition
         )
+        turn += 1
+        if not fit.template.parts and found.fits[found.category].template.parts:
+            turns = TURNS + 1  # these were not turned yet
     best = replace(
         best,
         found=replace(best.found, probabilities=found.probabilities),
@@ -176,8 +181,9 @@ def _rotation(
     )
     none = np.zeros(0)
     notices = told + unfolded.notices
-    if best.untrusted:
-        notices = (*notices, Notice("untrusted", best.untrusted))
+    reason = best.untrusted or _odd(unfolded.outline, found)
+    if reason:
+        notices = (*notices, Notice("untrusted", reason))
     flattened = Flattened(
         points=unfolded.points,
         start_uv=None,
@@ -188,6 +194,16 @@ def _rotation(
         seen=coverage(unfolded.surface, views),
     )
     return flattened, found
+
+
+def _odd(outline: Outline, found: Recognition) -> str:
+    """Why the category does not explain what was seen of the outline; empty: it does."""
+    if found.category == UNKNOWN:
+        return ""
+    deep = deep_inside_m(outline, found.fits[found.category])
+    if deep <= MOST_DEEP_M:
+        return ""
+    return f"{100 * deep:.0f} cm of its outline lie far inside that of its category"
 
 
 def _described(

@@ -32,7 +32,7 @@ NEAR_M = 0.02  # beyond the main group's outline
 END_SIGMA_M = 0.002
 STEPS = np.array([np.radians(8.0), 0.02, 0.02])  # of the search round a place: turn, shift
 FINEST = 16.0  # how much smaller they become
-TURNS = 2  # of fitting the outline and placing the groups
+WORTH_A_TURN = 4.0  # cost beyond the least, up to which a category is fitted and placed again
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,13 @@ class Placing:
     pose: Float  # (3,)
     state: Float  # (m,)
     motions: tuple[Motion, ...]  # of the groups; the first stays where it is
-    cost: float  # of the fit, in halves of squared sigmas
+    energy: float  # of the fit of the outline, in halves of squared sigmas
+    beside: float = 0.0  # cloth upon cloth of its own side, alike
+
+    @property
+    def cost(self) -> float:
+        """Of both."""
+        return self.energy + self.beside
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +113,21 @@ def place_groups(
             fits.append((energy, stiff, pose, state))
     least = min(fit[0] for fit in fits)
     likely = [fit for fit in fits if fit[0] < least + config.assembly.hopeless]
+    first = []
+    for done, (energy, template, pose, state) in enumerate(likely):
+        progress("place", 0.4 + 0.4 * done / len(likely))
+        alone_so = Placing(template, pose, state, (), energy)
+        first.append(_fitted(_placed(alone_so, shapes, config), shapes, main, config))
+    least = min(placing.cost for placing in first)
     found: dict[str, Placing] = {}
-    for done, (_, template, pose, state) in enumerate(likely):
-        progress("place", 0.4 + 0.6 * done / len(likely))
-        tried = _placed(shapes, main, template, pose, state, config)
-        best = found.get(template.category)
-        if best is None or tried.cost < best.cost:
-            found[template.category] = tried
+    for done, tried in enumerate(first):
+        progress("place", 0.8 + 0.2 * done / len(first))
+        if tried.cost < least + WORTH_A_TURN:
+            again = _fitted(_placed(tried, shapes, config), shapes, main, config)
+            tried = _placed(again, shapes, config)
+        category = tried.template.category
+        if category not in found or tried.cost < found[category].cost:
+            found[category] = tried
     return sorted(found.values(), key=lambda placing: placing.cost)
 
 
@@ -137,32 +151,28 @@ def _first_fits(
     return [(pose[k], state[k], float(energy[k])) for k in kept[:WAYS]]
 
 
-def _placed(
-    shapes: Sequence[_Shape],
-    main: Evidence,
-    template: Template,
-    pose: Float,
-    state: Float,
-    config: Config,
-) -> Placing:
-    """Place the groups under an outline, fit it to all of them, and so on."""
-    motions: list[Motion] = []
-    beside, energy = 0.0, np.inf
-    for turn in range(TURNS + 1):
-        outline = place(template, pose, state)[0][: template.vertices]
-        before, motions, beside = motions, [STAYS], 0.0
-        for k, shape in enumerate(shapes[1:], start=1):
-            images = _images(shapes[:k], motions, outline, shape)
-            starts = [before[k]] if before else _candidates(template, pose, state, shape)
-            motion, overlap = _best(images, shape, starts, config.assembly)
-            motions.append(motion)
-            beside += overlap
-        if turn == TURNS:
-            break
-        evidence = _evidence(main, shapes, motions, config)
-        poses, states, energies = refine(template, evidence, pose[None], state[None], CUTS)
-        pose, state, energy = poses[0], states[0], float(energies[0])
-    return Placing(template, pose, state, tuple(motions), energy + beside)
+def _placed(placing: Placing, shapes: Sequence[_Shape], config: Config) -> Placing:
+    """Place the groups under the outline, near where they are if they are somewhere."""
+    outline = place(placing.template, placing.pose, placing.state)[0][: placing.template.vertices]
+    motions, beside = [STAYS], 0.0
+    for k, shape in enumerate(shapes[1:], start=1):
+        images = _images(shapes[:k], motions, outline, shape)
+        if placing.motions:
+            starts: Sequence[Motion] = [placing.motions[k]]
+        else:
+            starts = _candidates(placing.template, placing.pose, placing.state, shape)
+        motion, overlap = _best(images, shape, starts, config.assembly)
+        motions.append(motion)
+        beside += overlap
+    return replace(placing, motions=tuple(motions), beside=beside)
+
+
+def _fitted(placing: Placing, shapes: Sequence[_Shape], main: Evidence, config: Config) -> Placing:
+    """Fit the outline to the groups as they are placed."""
+    evidence = _evidence(main, shapes, placing.motions, config)
+    start = placing.pose[None], placing.state[None]
+    poses, states, energies = refine(placing.template, evidence, *start, CUTS)
+    return replace(placing, pose=poses[0], state=states[0], energy=float(energies[0]))
 
 
 def _candidates(template: Template, pose: Float, state: Float, shape: _Shape) -> list[Motion]:

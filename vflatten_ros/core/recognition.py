@@ -111,15 +111,20 @@ def recognise_again(
     """The category once the item's loose parts were turned to rest, fitted from where it was.
 
     Legs together look like a skirt, so only categories of the same build are still weighed against
-    each other. Their sizes tell them apart, and splayed legs hide where the crotch is.
+    each other. Their sizes tell them apart, and splayed legs hide where the crotch is. What was
+    taken for a category without parts is recognised anew: a slit may have come out.
 
     Raises
     ------
     InvalidInput
         As recognise.
     """
-    evidence = evidence_from(outline, points, config)
     before = found.fits[found.category]
+    if not before.template.parts:
+        anew = recognise(outline, points, templates, config)
+        if anew.category != UNKNOWN:
+            return anew
+    evidence = evidence_from(outline, points, config)
     alike = [t for t in templates if t.same_build(before.template)]
     alike = [t for t in alike if found.probabilities.get(t.category, 0.0) > WORTH_WEIGHING]
     fits = {t.category: _fitted_from(before, t, evidence) for t in alike or [before.template]}

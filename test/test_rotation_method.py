@@ -112,3 +112,10 @@ def test_the_same_bytes_on_one_thread_and_without_views_prepared_before(monkeypa
     monkeypatch.setattr(parallel, "THREADS", 1)
     again = pipeline.flatten_garment(replayed.views, (), replayed.templates, ALL_VIEWS)
     assert json_text(garment_result(again, replayed.views)) == first
+
+
+@pytest.mark.slow
+def test_an_outline_that_its_category_does_not_explain_is_not_trusted(monkeypatch):
+    monkeypatch.setattr(pipeline, "MOST_DEEP_M", -1.0)
+    garment = replay_recording(BAGS / "SH1_1", ALL_VIEWS).garment
+    assert any("far inside" in n.text for n in garment.notices if n.code == "untrusted")

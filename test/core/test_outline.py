@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flat import lying_at
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.distances import link_steps
 from vflatten_ros.core.fusion import Samples
 from vflatten_ros.core.geometry import twice_area
-from vflatten_ros.core.rotation import Surface, edges_laid, outline_of
+from vflatten_ros.core.rotation import Surface, Unfolded, edges_laid, outline_of, together
 from vflatten_ros.core.sheets import Links
 
 CONFIG = RotationConfig()
@@ -86,3 +87,29 @@ def test_where_both_sides_of_a_rim_lie_side_by_side_the_cloth_ends():
     assert list(edges_laid(surface, np.arange(5), uv)) == [1, 1, 2, 2, 2]
     assert list(edges_laid(surface, np.array([1, 2, 4]), uv[[1, 2, 4]])) == [2, 2, 2]
     assert (edge == 2).all()
+
+
+@pytest.mark.parametrize(("gap_m", "told"), [(0.0, False), (0.05, True)])
+def test_a_group_that_lies_apart_from_the_rest_is_told(gap_m, told):
+    uv, edge = square(lambda uv: np.ones(len(uv), dtype=bool))
+    apart = np.array([SIDE_M + gap_m, 0.0])
+    small = uv[:, 0] < SIDE_M / 2
+    places, edges = np.vstack([uv, uv[small] + apart]), np.r_[edge, edge[small]]
+    n, first = len(places), len(uv)
+    xyz = np.column_stack([places, np.zeros(n)])
+    normal = np.tile([0.0, 0.0, 1.0], (n, 1))
+    none, flags = np.zeros(0, dtype=np.int64), np.ones((n, 1), dtype=bool)
+    links = Links(none, none, np.zeros(0), none > 0, np.zeros(0))
+    samples = Samples(xyz, normal, np.full(n, 3e-4), np.arange(n), flags)
+    steps, zero = link_steps(xyz, normal, links), np.zeros(n, dtype=np.int64)
+    pixel = np.column_stack([zero, zero])
+    surface = Surface(samples, links, steps, edges, np.zeros(n), zero, pixel)
+    groups = []
+    for row in (np.arange(first), np.arange(first, n)):
+        points, up = lying_at(places[row]), np.ones(len(row))
+        outline = outline_of(points.uv, points.sigma_m, edges[row], CONFIG)
+        firm = np.ones(len(row), dtype=bool)
+        groups.append(Unfolded(surface, (), points, row, up, firm, outline, 0.0, 0.0, ()))
+    both = together(groups, (), [g.points for g in groups], [g.side for g in groups], CONFIG)
+    assert [notice.code for notice in both.notices] == ["untrusted"] * told
+    assert all("33 %" in notice.text for notice in both.notices)

@@ -69,6 +69,21 @@ def test_a_fit_goes_on_from_where_it_was_when_its_notch_has_closed():
     assert (anew.points()[waist] - anew.points()[crotch])[1] < 0
 
 
+@pytest.mark.parametrize("turned", [0.0, np.pi])
+def test_a_category_is_fitted_from_where_its_groups_were_placed(turned):
+    """Legs that touch look alike either way up; where the groups met, the placing knows."""
+    closed = drawn([[0, 0], [0.34, 0], [0.36, 0.38], [-0.02, 0.38]])
+    only = tuple(t for t in TEMPLATES if t.category == "shorts")
+    anyhow = recognise(*closed, only, RecognitionConfig()).fits["shorts"]
+    middle = np.array([0.17, 0.19])
+    turn = np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]])
+    pose = np.r_[anyhow.pose[0] + turned, turn @ (anyhow.pose[1:] - middle) + middle]
+    begin = {"shorts": (pose, anyhow.state)}
+    fit = recognise(*closed, only, RecognitionConfig(), begin=begin).fits["shorts"]
+    off = (fit.pose[0] - pose[0] + np.pi) % (2 * np.pi) - np.pi
+    assert abs(off) < 0.2
+
+
 def two_legs(inseam_m):
     """Shorts or trousers with a waist of 0.32 m and a rise of 0.22 m, by the length of the legs."""
     top = inseam_m + 0.22

@@ -34,7 +34,7 @@ from vflatten_ros.core.rotation import (
     unfold_surface,
 )
 from vflatten_ros.core.templates import Template
-from vflatten_ros.core.values import Progress
+from vflatten_ros.core.values import Float, Progress
 
 WHOLE = "whole"
 WAYS = (  # draw of the samples, how, greatest doubt
@@ -221,8 +221,10 @@ class _Draw:
                 break
             sigma_m = config.assembly.sigma_m
             beside = put_beside(laid, placing.motions, sigma_m, config.rotation)
-            only = tuple(t for t in self._templates if t.category == placing.template.category)
-            tried = _recognised(beside, only, config, progress)
+            (only,) = (t for t in self._templates if t.category == placing.template.category)
+            # all groups' ends say which way up it lies; where groups meet, the outline may not
+            begin = {only.category: (placing.pose, only.state_of(placing.template, placing.state))}
+            tried = _recognised(beside, (only,), config, progress, begin)
             tries.append(replace(tried, found=_among(tried.found, odds)))
         return _best(tries)
 
@@ -239,7 +241,12 @@ def _among(found: Recognition, odds: Mapping[str, float]) -> Recognition:
 
 
 def _recognised(
-    unfolded: Unfolded, templates: tuple[Template, ...], config: Config, progress: Progress
+    unfolded: Unfolded,
+    templates: tuple[Template, ...],
+    config: Config,
+    progress: Progress,
+    begin: Mapping[str, tuple[Float, Float]] | None = None,
 ) -> Tried:
     outline, points = unfolded.outline, unfolded.points
-    return Tried(unfolded, recognise(outline, points, templates, config.recognition, progress))
+    found = recognise(outline, points, templates, config.recognition, progress, begin)
+    return Tried(unfolded, found)

@@ -56,6 +56,7 @@ def recognise(
     templates: tuple[Template, ...],
     config: RecognitionConfig,
     progress: Progress = no_progress,
+    begin: Mapping[str, tuple[Float, Float]] | None = None,
 ) -> Recognition:
     """Compare a flattened item with every category.
 
@@ -84,7 +85,7 @@ def recognise(
     progress("recognition", 0.0)
     evidence = evidence_from(outline, points, config)
     scores = model_image_scores(evidence.outline, templates, config.decay, config.model_rotations)
-    fits = fit_templates(templates, evidence, config, progress)
+    fits = fit_templates(templates, evidence, config, progress, begin)
     probabilities = _probabilities(fits, evidence, config)
     category = max(probabilities, key=lambda name: probabilities[name])
     known = {name: p for name, p in probabilities.items() if name != UNKNOWN}
@@ -167,12 +168,18 @@ def fit_templates(
     evidence: Evidence,
     config: RecognitionConfig,
     progress: Progress = no_progress,
+    begin: Mapping[str, tuple[Float, Float]] | None = None,
 ) -> dict[str, Fit]:
     """The best pose and cut of every category; those that turn out hopeless with less effort."""
-    coarse = {}
+    coarse, known = {}, begin or {}
     for done, template in enumerate(templates):
         progress("recognition", 0.2 + 0.4 * done / len(templates))
-        coarse[template.category] = _coarse(template, evidence.thinned(), config)
+        if template.category in known:
+            pose, state = known[template.category]
+            start = pose[None], state[None]
+            coarse[template.category] = refine(template, evidence.thinned(), *start, COARSE[-1][0])
+        else:
+            coarse[template.category] = _coarse(template, evidence.thinned(), config)
     least = min(float(energy[0]) for _, _, energy in coarse.values())
     fits = {}
     for done, template in enumerate(templates):

@@ -70,6 +70,7 @@ MOST_DOUBTFUL = 0.1  # of the samples, at a doubt of 1
 TOLD_M = 1e-4  # length of a link between samples that are said to be one point of the cloth
 TOLD_AMONG = 8  # samples nearest to such a point, of which the nearest that faces its way is it
 CUT_M = 0.008  # between points of one slit
+WITHIN = 0.5  # share of a group's points in the outline, below which it lies apart
 DEEP_M = 0.020  # how deep within the outline a slit lies, by the middle of its points
 SLIT_M = 0.03  # widest slit of which one side tells what the other is
 RIM_LAID_M = 0.015  # between the two sides of a rim that lies flat as one
@@ -208,6 +209,11 @@ def together(
     side = np.concatenate(sides)
     outline = _outline(surface, row, all_points, side, firm, config)
     notices = {notice.code: notice for g in groups for notice in g.notices}
+    within = [float(_within(p.uv, outline.uv).mean()) for p in points]
+    if min(within) < WITHIN:
+        apart = count[int(np.argmin(within))] / count.sum()
+        text = f"a part, {100 * apart:.0f} % of what was seen, lies apart from the rest"
+        notices["untrusted"] = Notice("untrusted", text)
     stress = float(np.sqrt((all_points.stress**2).mean()))
     return Unfolded(
         surface,
@@ -571,6 +577,17 @@ def outline_of(
     inferred = _near(contour, uv[edge == 2]) > HIDDEN_SHARE * _near(contour, uv[edge > 0])
     inferred &= ~_before_an_end(contour, inferred)
     return Outline(contour, sigma_m[near], inferred)
+
+
+def _within(uv: Float, outline: Float) -> Bool:
+    """Which points lie in a closed outline, to a cell."""
+    low = np.minimum(uv.min(axis=0), outline.min(axis=0)) - CELL_M
+    corners, (column, row) = (outline - low) / CELL_M, np.rint((uv - low) / CELL_M).astype(int).T
+    cols, rows = np.r_[corners.max(axis=0), column.max(), row.max()].reshape(2, 2).max(axis=0)
+    image = np.zeros((int(rows) + 2, int(cols) + 2), np.uint8)
+    cv2.fillPoly(image, [np.rint(corners).astype(np.int32)], (1,))
+    found: Bool = image[row, column] > 0
+    return found
 
 
 def _cut(inside: NDArray[np.uint8], cuts: Sequence[Float]) -> NDArray[np.uint8]:

@@ -70,6 +70,8 @@ def recognise(
         Categories to choose from.
     config : RecognitionConfig
     progress : Progress
+    begin : mapping of str to (ndarray of shape (3,), ndarray of shape (m,)), optional
+        By category, the pose and state that it is fitted from, in place of all rotations.
 
     Returns
     -------

@@ -285,11 +285,8 @@ def _axis_error(
     surfaces: Sequence[ViewSurface], poses: Sequence[Float], config: RotationConfig
 ) -> Float:
     """(4,) axis error that the views' poses tell of."""
-    own, normal, right = (
-        _own_information(config),
-        np.diag(_axis_information(config)),
-        np.zeros(AXIS),
-    )
+    own, right = _own_information(config), np.zeros(AXIS)
+    normal = np.diag(_axis_information(config))
     for surface, pose in zip(surfaces, poses, strict=True):
         effect = _effect(surface)
         normal += effect.T @ (own[:, None] * effect)

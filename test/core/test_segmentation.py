@@ -286,3 +286,49 @@ def test_a_pile_on_the_table_below_is_left_out():
     mask = kept(scene.cloud())
     assert foreign(mask, scene.label) == 0
     assert recall(mask, scene.label) > 0.99
+
+
+def fattened(cloud, px):
+    """What is in front made wider by some pixels, as block matching does."""
+    z = np.where(np.isnan(cloud.xyz[..., 2]), 9.0, cloud.xyz[..., 2])
+    ray = np.stack([hanging_item().x, hanging_item().y, np.ones(z.shape)], axis=2)
+    for _ in range(px):
+        beside = np.stack(
+            [np.roll(z, (down, right), (0, 1)) for down in (-1, 0, 1) for right in (-1, 0, 1)]
+        ).min(axis=0)
+        z = np.where(z - beside > 0.01, beside, z)
+    z[z == 9.0] = np.nan
+    return Cloud(0, "rig", (ray * z[..., None]).astype(np.float32), None)
+
+
+def test_edges_that_stereo_makes_wider_are_trimmed():
+    scene = hanging_item()
+    cloud = scene.cloud(noise=0.0)
+    item = kept(cloud)
+    wide = kept(fattened(cloud, 3))
+    narrow = kept(fattened(cloud, 3), config=SegmentationConfig(trim_px=3))
+    assert wide.sum() - item.sum() > 2000
+    assert (narrow & ~item).sum() < 0.02 * (wide & ~item).sum()
+    assert (narrow & item).sum() > 0.97 * item.sum()
+
+
+def test_trimming_keeps_what_lies_round_holes_and_behind_an_edge():
+    scene = hanging_item()
+    cloud = scene.cloud(noise=0.0)
+    xyz = cloud.xyz.copy()
+    row, col = (int(x) for x in np.argwhere(kept(cloud)).mean(axis=0))
+    xyz[row, col - 1 : col + 2] = np.nan
+    step = np.s_[row + 30 : row + 50, col - 5 : col]
+    xyz[step] *= 0.96  # a flap before the rest
+    trim = SegmentationConfig(trim_px=2)
+    found = kept(Cloud(0, "rig", xyz, None), config=trim)
+    assert found[row - 2 : row + 3, col - 3].all() and found[row - 2 : row + 3, col + 3].all()
+    assert not found[row + 40, col - 5] and not found[row + 40, col - 1]
+    assert found[row + 40, col - 3] and found[row + 40, col] and found[row + 40, col - 6]
+
+
+def test_an_unorganised_cloud_is_not_trimmed():
+    cloud = hanging_item().cloud()
+    points = cloud.xyz[np.isfinite(cloud.xyz[..., 2])][None]
+    flat = Cloud(0, "rig", points, None)
+    assert kept(flat, config=SegmentationConfig(trim_px=3)).sum() == kept(flat).sum()

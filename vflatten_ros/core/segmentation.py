@@ -11,6 +11,7 @@ All lengths are metric: the image's resolution enters only by the spacing measur
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -26,6 +27,7 @@ Pixels = NDArray[np.int32]
 SAMPLE = 1500  # points from which spacing and planes are estimated
 WALLS = 3  # most planes taken away
 LEVEL = 0.7  # least cosine between the axis and the normal of a table or floor
+HOLE_PX = 5  # width of the gaps in the item that are no borders of it
 SIDE = 0.1  # share of the image at either side in which no item is expected
 
 
@@ -93,7 +95,32 @@ def segment(cloud: Cloud, calibration: Calibration, config: SegmentationConfig) 
     index = index[held & ~foreign]
     _check_count(len(index), config)
     pixel: Pixels = np.stack(np.divmod(index, cloud.xyz.shape[1]), axis=1).astype(np.int32)
+    if config.trim_px:
+        pixel = pixel[_within_edges(cloud, pixel, max(config.support_m, 3.0 * spacing), config)]
+        _check_count(len(pixel), config)
     return pixel
+
+
+def _within_edges(
+    cloud: Cloud, pixel: Pixels, tolerance: float, config: SegmentationConfig
+) -> Bool:
+    """Which of the item's points are not at its border, nor before what it hides of itself.
+
+    Stereo matches blocks, and so gives pixels beside an edge the depth of what is in front.
+    """
+    if not cloud.organised:
+        return np.ones(len(pixel), dtype=bool)
+    trim = config.trim_px
+    low = pixel.min(axis=0) - trim - HOLE_PX
+    row, col = (pixel - low).T
+    item = np.zeros(pixel.max(axis=0) - low + 1 + trim + HOLE_PX, np.uint8)
+    item[row, col] = 1
+    closed = cv2.morphologyEx(item, cv2.MORPH_CLOSE, np.ones((HOLE_PX, HOLE_PX), np.uint8))
+    depth = np.where(closed > 0, -np.inf, np.inf).astype(np.float32)  # a hole is no border
+    depth[row, col] = cloud.xyz[pixel[:, 0], pixel[:, 1], 2]
+    farthest = cv2.dilate(depth, np.ones((2 * trim + 1, 2 * trim + 1), np.uint8))  # as a block
+    kept: Bool = farthest[row, col] - depth[row, col] <= tolerance
+    return kept
 
 
 def _check_count(count: int, config: SegmentationConfig) -> None:

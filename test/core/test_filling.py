@@ -1,4 +1,4 @@
-"""A rectangle of which a corner is missing: filled where no view shows it, not where it ends."""
+"""A rectangle of which a corner is missing, seen to end there or not, or too much is there."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from flat import lying_at
 
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import RecognitionConfig
-from vflatten_ros.core.filling import DEEP_M, deep_inside_m, filled
+from vflatten_ros.core.filling import DEEP_M, deep_inside_m, with_category
 from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.recognition import recognise
 from vflatten_ros.core.values import Outline
@@ -28,10 +28,13 @@ CORNERS = np.array(
 NOTCH = (2, 3)  # the sides where it ends
 
 
-def notched(inferred_sides=NOTCH, step=1):
+MISFIT_M = RecognitionConfig().misfit_m
+
+
+def notched(inferred_sides=NOTCH, step=1, corners=CORNERS):
     """Outline and points of the rectangle; `step` -1 goes round it the other way."""
     parts, inferred = [], []
-    for k, (start, end) in enumerate(zip(CORNERS, np.roll(CORNERS, -1, axis=0), strict=True)):
+    for k, (start, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
         count = round(float(np.abs(end - start).sum()) / STEP_M)
         parts.append(start + np.linspace(0, 1, count, endpoint=False)[:, None] * (end - start))
         inferred.append(np.full(count, k in inferred_sides))
@@ -57,7 +60,7 @@ def fit_of(outline, points):
 @pytest.mark.parametrize("step", [1, -1])
 def test_a_corner_that_no_view_shows_is_the_category_s(step):
     outline, points = notched(step=step)
-    found = filled(outline, fit_of(outline, points))
+    found = with_category(outline, fit_of(outline, points), MISFIT_M)
     assert step * area(found) == pytest.approx(WIDTH_M * LENGTH_M, rel=0.01)
     away = np.abs(found.uv - CORNERS[3] - NOTCH_M).max(axis=1)
     added = away < 0.8 * NOTCH_M
@@ -67,13 +70,32 @@ def test_a_corner_that_no_view_shows_is_the_category_s(step):
     assert (found.sigma_m[away > 1.3 * NOTCH_M] == 0.002).all()
 
 
-def test_where_the_cloth_was_seen_to_end_nothing_is_added():
-    outline, points = notched(inferred_sides=())
-    assert filled(outline, fit_of(outline, points)) is outline
-    elsewhere, points = notched(inferred_sides=(5,))
-    assert (
-        area(filled(elsewhere, fit_of(elsewhere, points))) < WIDTH_M * LENGTH_M - 0.8 * NOTCH_M**2
-    )
+@pytest.mark.parametrize("inferred_sides", [(), (5,)])
+def test_what_was_seen_to_differ_a_little_stays(inferred_sides):
+    little = 0.008
+    corners = CORNERS + np.array([[0, 0], [0, 0], [0, -0.1], [0.0, -0.1], [0, 0], [0, 0]])
+    corners[2:5, 1] = LENGTH_M - little * np.array([1, 1, 0])
+    outline, points = notched(inferred_sides, corners=corners)
+    found = with_category(outline, fit_of(outline, points), MISFIT_M)
+    middle = np.abs(found.uv - [WIDTH_M - NOTCH_M / 2, LENGTH_M]) < [0.2 * NOTCH_M, 0.05]
+    step = LENGTH_M - found.uv[middle.all(axis=1), 1]
+    assert step.mean() == pytest.approx(0.85 * little, abs=0.002)
+    assert not found.inferred[middle.all(axis=1)].any()
+
+
+def test_what_was_seen_to_differ_much_is_the_category_s_and_said_to_be():
+    tail = np.array([[0.0, 0.2], [-0.12, 0.2], [-0.12, 0.17], [0.0, 0.17]])
+    outline, points = notched((), corners=np.vstack([CORNERS, tail]))
+    fit = fit_of(outline, points)
+    found = with_category(outline, fit, MISFIT_M)
+    assert area(found) == pytest.approx(WIDTH_M * LENGTH_M, rel=0.02)
+    assert found.uv[:, 0].min() > -0.02
+    corner = np.abs(found.uv - CORNERS[3] - NOTCH_M).max(axis=1) < 0.5 * NOTCH_M
+    assert corner.any() and found.inferred[corner].all()
+    assert found.inferred.mean() < 0.3
+    wide = with_category(outline, fit, 10 * MISFIT_M)  # of which it could be any such item
+    assert area(wide) < WIDTH_M * LENGTH_M - 0.6 * NOTCH_M**2
+    assert wide.uv[:, 0].min() < -0.05
 
 
 @pytest.mark.parametrize("start", [0, 40, -235])  # the last begins within the notch

@@ -1,10 +1,9 @@
-"""The outline beside the category's: filled where no view shows it, and odd where it was seen."""
+"""The outline beside the category's: both weighed together, and odd where it was seen."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.geometry import thinned_loop, twice_area
@@ -12,16 +11,17 @@ from vflatten_ros.core.template_fit import Fit, place
 from vflatten_ros.core.values import Float, Outline
 
 CELL_M = 0.002  # of the images
-SAME_M = 0.004  # between the outline before and after where it stays as it is
-THINNEST_CELLS = 3  # of what is added
+CUT = 4.0  # standard deviations of a difference, from which on what was seen weighs nothing
 DEEP_M = 0.04  # inside the category's outline, which is no mere inaccuracy
 MOST_DEEP_M = 0.13  # longest stretch seen there of results that turned out right: 0.123
 
 
-def filled(outline: Outline, fit: Fit) -> Outline:
-    """Add what the fitted category has beyond inferred parts of an outline.
+def with_category(outline: Outline, fit: Fit, misfit_m: float) -> Outline:
+    """What was seen of an outline and the category's together, each by how sure it is.
 
-    Where the cloth was seen to end nothing is added, whatever the category has there.
+    Both are distances inside a border, so they are weighed cell by cell. Far beyond what an item
+    may differ from its category by, what was seen lies wrongly, and weighs nothing (Tukey's
+    biweight). Where no view shows the outline the category adds what it has beyond.
 
     Parameters
     ----------
@@ -29,39 +29,45 @@ def filled(outline: Outline, fit: Fit) -> Outline:
         Of what was seen, inferred where the cloth goes on.
     fit : Fit
         The category's outline as it fits.
+    misfit_m : float
+        How far an item's outline differs from the category's, one standard deviation.
 
     Returns
     -------
     Outline
         Inferred where it is the category's; as uncertain there as the fit.
     """
-    if not outline.inferred.any():
-        return outline
     points, slope = place(fit.template, fit.pose, fit.state)
     k = fit.template.vertices
     low = np.minimum(outline.uv.min(axis=0), points[:k].min(axis=0)) - 4 * CELL_M
     high = np.maximum(outline.uv.max(axis=0), points[:k].max(axis=0)) + 4 * CELL_M
     cols, rows = np.ceil((high - low) / CELL_M).astype(int) + 1
-    seen = _image(outline.uv, low, (rows, cols))
-    beyond = _image(points[:k], low, (rows, cols)) & (1 - seen)
-    at = np.argwhere(beyond)
-    nearest = cKDTree(outline.uv).query(low + CELL_M * at[:, ::-1])[1]
-    off = at[~outline.inferred[nearest]]
-    beyond[off[:, 0], off[:, 1]] = 0
-    thin = np.ones((THINNEST_CELLS, THINNEST_CELLS), np.uint8)
-    beyond = cv2.morphologyEx(beyond, cv2.MORPH_OPEN, thin).astype(np.uint8)
-    contours, _ = cv2.findContours(seen | beyond, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    category = _inside_m(points[:k], low, (rows, cols))
+    differs = _inside_m(outline.uv, low, (rows, cols)) - category
+    if outline.inferred.any():
+        cells = low + CELL_M * np.argwhere(np.ones((rows, cols)))[:, ::-1]
+        nearest = cKDTree(outline.uv).query(cells)[1].reshape(rows, cols)
+        differs[outline.inferred[nearest] & (differs < 0.0)] = 0.0
+    seen_m = float(np.median(outline.sigma_m))
+    share = misfit_m**2 / (misfit_m**2 + seen_m**2)
+    bounded = np.minimum(np.abs(differs) / (CUT * np.hypot(misfit_m, seen_m)), 1.0)
+    inside = category + share * (1.0 - bounded**2) ** 2 * differs > 0.0
+    contours, _ = cv2.findContours(
+        inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    if not contours:
+        return outline
     uv = low + CELL_M * thinned_loop(max(contours, key=cv2.contourArea)[:, 0].astype(np.float64))
     if twice_area(uv) * twice_area(outline.uv) < 0:
         uv = uv[::-1]
     away, near = cKDTree(outline.uv).query(uv)
-    added = away > SAME_M
+    moved = away > misfit_m
     variance = np.einsum("pim,mn,pin->pi", slope[:k], fit.covariance, slope[:k])
     sigma = float(np.sqrt(variance.mean()))
     return Outline(
         uv,
-        np.where(added, np.hypot(sigma, outline.sigma_m[near]), outline.sigma_m[near]),
-        added | outline.inferred[near],
+        np.where(moved, np.hypot(sigma, misfit_m), outline.sigma_m[near]),
+        moved | outline.inferred[near],
     )
 
 
@@ -90,7 +96,10 @@ def deep_inside_m(outline: Outline, fit: Fit) -> float:
     return float(np.bincount(stretch[odd], length[odd]).max())
 
 
-def _image(uv: Float, low: Float, shape: tuple[int, int]) -> NDArray[np.uint8]:
+def _inside_m(uv: Float, low: Float, shape: tuple[int, int]) -> Float:
+    """How far inside a closed line every cell lies; outside negative."""
     image = np.zeros(shape, dtype=np.uint8)
     cv2.fillPoly(image, [np.rint((uv - low) / CELL_M * 16).astype(np.int32)], (1,), shift=4)
-    return image
+    away: Float = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_5).astype(np.float64)
+    away -= cv2.distanceTransform(1 - image, cv2.DIST_L2, cv2.DIST_MASK_5)
+    return CELL_M * away

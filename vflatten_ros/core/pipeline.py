@@ -11,7 +11,7 @@ from vflatten_ros.core.assembly import assemble
 from vflatten_ros.core.automatic_pair import fill_up, flatten_best_pair
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
-from vflatten_ros.core.filling import MOST_DEEP_M, deep_inside_m, filled
+from vflatten_ros.core.filling import MOST_DEEP_M, deep_inside_m, with_category
 from vflatten_ros.core.grain import suited
 from vflatten_ros.core.hypotheses import likeliest
 from vflatten_ros.core.measurement import measure
@@ -31,6 +31,7 @@ from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.two_views import flatten_two_views, named_views
 from vflatten_ros.core.unseen import advice, coverage, enough, notice_of
+from vflatten_ros.core.upright import upright
 from vflatten_ros.core.values import (
     Correspondence,
     FlatGarment,
@@ -230,7 +231,7 @@ def _described(
         replace(m, sigma_m=float(np.hypot(m.sigma_m, shared))) for m in measured.measurements
     )
     if automatic and recognition.fit is not None and recognition.category != UNKNOWN:
-        outline = filled(outline, recognition.fit)
+        outline = with_category(outline, recognition.fit, config.recognition.misfit_m)
     told = {notice.code for notice in flattened.notices}
     garment = FlatGarment(
         method=config.method,
@@ -251,6 +252,8 @@ def _described(
         quality=measured.quality,
         notices=flattened.notices + tuple(n for n in measured.notices if n.code not in told),
     )
+    if recognition.fit is not None and recognition.category != UNKNOWN:
+        garment = upright(garment, recognition.fit.pose)
     if flattened.seen is None:
         return garment
     unseen = advice(garment, flattened.seen, config.measurement.low_coverage)

@@ -49,7 +49,7 @@ item flat goes through are summed over the ways that it took.
 TOGETHER = {
     "register, fuse": ("surface", "register", "fuse"),
     "link, ramps": ("link", "ramps"),
-    "pieces, distances, unfold": ("join", "pieces", "distances", "unfold"),
+    "pieces, distances, unfold": ("pieces", "distances", "unfold"),
     "place": ("place",),
     "outline, recognition": ("outline", "recognition"),
     "parts, measurement": ("parts", "measurement"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.distances import link_distances, surface_distances
+from vflatten_ros.core.distances import largest_pieces, link_distances, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.sheets import link_samples
 
@@ -111,3 +111,14 @@ def test_links_among_some_samples_are_those_of_these_samples_alone():
     assert len(among.a) > 500
     length = np.linalg.norm(xyz[some][among.a] - xyz[some][among.b], axis=1)
     assert np.abs(length - among.length_m).max() < 1e-3
+
+
+def test_pieces_on_both_sides_of_a_strip_come_largest_first():
+    xyz, normal, flat = rolled(10.0)
+    links = link_samples(xyz, normal, CONFIG)
+    passable = np.abs(flat[:, 0] - 0.08) > 0.012
+    one, other = largest_pieces(links, passable, least=100)
+    assert one.sum() > other.sum() > 500
+    assert (flat[one, 0] > 0.08).all() and (flat[other, 0] < 0.08).all()
+    assert len(largest_pieces(links, passable, least=int(other.sum()))) == 1
+    assert len(largest_pieces(links, passable | True, least=100)) == 1

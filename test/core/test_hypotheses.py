@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from vflatten_ros.core import hypotheses
-from vflatten_ros.core.config import Config
+from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.hypotheses import Tried, rival, settled
 
 
@@ -82,6 +82,15 @@ def test_ways_that_disagree_settle_it_only_if_one_is_much_better():
     assert settled([tried(misfit=-0.7, sure=0.85), tried(misfit=0.6)])
 
 
+def test_three_ways_outvote_one_that_disagrees():
+    good, like, other = tried(misfit=-0.3), tried(misfit=0.2), tried(misfit=0.6, category="skirt")
+    assert not settled([good, like, other])
+    assert settled([good, like, like, other])
+    assert not settled([good, like, like, other, other])
+    assert not settled([good, like, tried(misfit=1.5), other])  # too bad a way to count
+    assert not settled([tried(misfit=-0.3, sure=0.85), like, like, other])
+
+
 def test_a_bad_way_and_a_near_tie_of_categories_are_not_to_be_trusted():
     assert not tried().untrusted and not tried(sure=0.75).untrusted
     assert "does not lie flat" in tried(overlap=0.2).untrusted
@@ -89,7 +98,7 @@ def test_a_bad_way_and_a_near_tie_of_categories_are_not_to_be_trusted():
     near, farther = tried(misfit=-0.4, category="skirt"), tried(misfit=-0.3, category="skirt")
     assert rival([tried(), near, farther], 0.15) == "skirt"
     assert rival([tried(), farther, tried(misfit=-0.4, category="unknown")], 0.15) == ""
-    assert "nearly as good a skirt" in dataclasses.replace(tried(), rival="skirt").untrusted
+    assert "nearly as good a skirt" in replace(tried(), rival="skirt").untrusted
 
 
 @dataclass(frozen=True)
@@ -101,26 +110,33 @@ class Linked:
 @pytest.fixture
 def method(monkeypatch):
     """The stages replaced by notes of what they were called with."""
-    noted = SimpleNamespace(ramps=[], found=[], drawn=[], misfit={})
+    noted = SimpleNamespace(ramps=[], found=[], drawn=[], misfit={}, configs=[])
 
     def drawn_again(fused, draw, *_):
         noted.drawn.append(draw)
         return draw
+
+    def linked(fused, config, *_):
+        noted.configs.append(config)
+        return Linked(fused)
 
     def recognised(surface, *_):
         noted.found.append(surface)
         return tried(misfit=noted.misfit.get(surface.draw, 0.5))
 
     monkeypatch.setattr(hypotheses, "drawn_again", drawn_again)
-    monkeypatch.setattr(hypotheses, "link_surface", lambda fused, *_: Linked(fused))
+    monkeypatch.setattr(hypotheses, "link_surface", linked)
     monkeypatch.setattr(hypotheses, "doubts", lambda *_: noted.ramps.append(1) or 2.0)
     monkeypatch.setattr(hypotheses, "unfold_surface", lambda surface, *_: surface)
+    monkeypatch.setattr(hypotheses, "group_pieces", lambda surface, *_: surface)
     monkeypatch.setattr(hypotheses, "_recognised", recognised)
+    monkeypatch.setattr(hypotheses._Draw, "_from_groups", lambda _, one, how: recognised(one))
     return noted
 
 
 def ways(*draws_and_doubts):
-    return tuple((draw, hypotheses.WHOLE, doubt) for draw, doubt in draws_and_doubts)
+    how = {True: hypotheses.PUZZLE, False: hypotheses.WHOLE}
+    return tuple((draw, how[np.isfinite(doubt)], doubt) for draw, doubt in draws_and_doubts)
 
 
 @pytest.mark.parametrize(("misfit", "looked"), [(-0.5, 0), (0.5, 1)])
@@ -145,3 +161,29 @@ def test_samples_are_drawn_again_once_and_only_where_those_before_do_not_settle_
     assert method.drawn == [1, 2]
     assert [surface.draw for surface in method.found] == [0, 1, 1, 2]
     assert best.found.fit.misfit == -0.5
+
+
+def test_what_is_drawn_again_is_denser_and_flattened_further_as_such(method):
+    method.misfit = {0: 0.5, 1: -0.5}
+    best = hypotheses.likeliest(0, (), Config(), lambda *_: None)
+    first = RotationConfig()
+    denser = replace(
+        first,
+        spacing_m=hypotheses.FINER * first.spacing_m,
+        link_m=hypotheses.FINER * first.link_m,
+    )
+    assert best.found.fit.misfit == -0.5
+    assert method.configs == [first, denser]
+
+
+def test_no_more_ways_are_tried_than_asked(method):
+    few = replace(Config(), rotation=RotationConfig(ways=3))
+    hypotheses.likeliest(0, (), few, lambda *_: None)
+    assert len(method.found) == 3
+    hypotheses.likeliest(0, (), Config(), lambda *_: None)
+    assert len(method.found) == 3 + len(hypotheses.WAYS)
+
+
+def test_all_ways_can_be_asked_for():
+    (ways,) = (f for f in dataclasses.fields(RotationConfig) if f.name == "ways")
+    assert ways.metadata["high"] == ways.default == len(hypotheses.WAYS)

@@ -10,14 +10,18 @@ from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.rotation import outline_of
 from vflatten_ros.core.sheets import Links
-from vflatten_ros.core.slits import slits
+from vflatten_ros.core.slits import AWAY, slits
 
 CONFIG = RotationConfig()
 STEP_M, SIDE_M, AT_M = CONFIG.spacing_m, 0.2, 0.101
+TEAR_AT_M = 0.058
 
 
-def cloth(slit_m, up=1.0, hole_m=0.0):
-    """Samples of a square, slit from its lower edge at u = AT_M; edges; pairs that are linked."""
+def cloth(slit_m, up=1.0, hole_m=0.0, tear_m=0.0):
+    """Samples of a square, slit from its lower edge at u = AT_M; edges; pairs that are linked.
+
+    A tear leads from the middle of the slit to its right.
+    """
     uv = np.mgrid[0:SIDE_M:STEP_M, 0:SIDE_M:STEP_M].reshape(2, -1).T
     uv = uv[np.linalg.norm(uv - [0.05, 0.15], axis=1) > hole_m]
     a, b = cKDTree(uv).query_pairs(CONFIG.link_m, output_type="ndarray").T
@@ -25,9 +29,14 @@ def cloth(slit_m, up=1.0, hole_m=0.0):
     across = ((uv[a] - AT_M) * (uv[b] - AT_M))[:, 0] < 0
     far = np.linalg.norm(uv[a] - uv[b], axis=1) > 1.5 * hole_m if hole_m else np.zeros(len(a), bool)
     kept = ~(across & low) & ~far
+    over = ((uv[a] - TEAR_AT_M) * (uv[b] - TEAR_AT_M))[:, 1] < 0
+    right = np.abs((uv[a] + uv[b])[:, 0] / 2 - AT_M - tear_m / 2) < tear_m / 2
+    kept &= ~(over & right)
     border = (uv < STEP_M / 2).any(1) | (uv > SIDE_M - 1.5 * STEP_M).any(1)
     border |= (np.abs(uv[:, 0] - AT_M) < STEP_M) & (uv[:, 1] < slit_m)
     border |= np.linalg.norm(uv - [0.05, 0.15], axis=1) < hole_m + STEP_M
+    along = np.abs(uv[:, 0] - AT_M - tear_m / 2) < tear_m / 2
+    border |= along & (np.abs(uv[:, 1] - TEAR_AT_M) < STEP_M)
     return uv, np.full(len(uv), up), border.astype(int), a[kept], b[kept]
 
 
@@ -42,30 +51,38 @@ def layers(*each):
 
 
 def test_a_slit_is_found_along_its_whole_length_and_nowhere_else():
-    (found,) = slits(*layers(cloth(0.12)))
+    (found,) = slits(*layers(cloth(0.12)), CONFIG)
     assert len(found) > 30
     assert np.abs(found[:, 0] - AT_M).max() < 2 * STEP_M
     assert found[:, 1].min() < 0.01 and found[:, 1].max() == pytest.approx(0.12, abs=0.02)
+
+
+def test_a_slit_with_strays_beside_it_is_one():
+    (found,) = slits(*layers(cloth(0.12, tear_m=0.048)), CONFIG)
+    off = np.abs(found[:, 0] - AT_M)
+    assert off.max() < AWAY * STEP_M
+    assert np.median(off) < STEP_M / 2
+    assert np.ptp(found[off < STEP_M, 1]) > 0.09
 
 
 @pytest.mark.parametrize(
     "whole", [{"slit_m": 0.0}, {"slit_m": 0.05}, {"slit_m": 0, "hole_m": 0.008}]
 )
 def test_a_sheet_a_notch_and_a_hole_are_none(whole):
-    assert not slits(*layers(cloth(**whole)))
+    assert not slits(*layers(cloth(**whole)), CONFIG)
 
 
 def test_an_item_has_a_slit_where_all_of_its_layers_do():
-    (found,) = slits(*layers(cloth(0.12), cloth(0.12, up=-1.0)))
+    (found,) = slits(*layers(cloth(0.12), cloth(0.12, up=-1.0)), CONFIG)
     assert len(found) > 60
-    assert not slits(*layers(cloth(0.12), cloth(0.0, up=-1.0)))
+    assert not slits(*layers(cloth(0.12), cloth(0.0, up=-1.0)), CONFIG)
 
 
 def test_the_outline_goes_in_and_out_of_a_slit():
     uv, side, edge, links = layers(cloth(0.12), cloth(0.12, up=-1.0))
     sigma = np.full(len(uv), 0.002)
     shut = outline_of(uv, sigma, edge, CONFIG).uv
-    line = outline_of(uv, sigma, edge, CONFIG, slits(uv, side, edge, links)).uv
+    line = outline_of(uv, sigma, edge, CONFIG, slits(uv, side, edge, links, CONFIG)).uv
     within = np.array([AT_M, 0.06])
     assert np.linalg.norm(shut - within, axis=1).min() > 0.05
     assert np.linalg.norm(line - within, axis=1).min() < 0.006
@@ -83,7 +100,7 @@ def test_the_outline_does_not_follow_what_runs_along_it():
 def test_a_slit_may_go_on_among_strays_beyond_the_outline():
     uv, side, edge, links = layers(cloth(0.12), cloth(0.12, up=-1.0))
     sigma = np.full(len(uv), 0.002)
-    (found,) = slits(uv, side, edge, links)
+    (found,) = slits(uv, side, edge, links, CONFIG)
     longer = np.vstack([found, found - [0.0, 0.11]])
     line, same = (outline_of(uv, sigma, edge, CONFIG, (cut,)).uv for cut in (found, longer))
     assert abs(twice_area(line) / twice_area(same) - 1) < 0.02

@@ -545,11 +545,11 @@ class RotationConfig(Checked):
         0.008, "Points farther apart are not the same cloth, m.", low=0.001, high=0.1
     )
     register_rounds: int = option(4, "Most rounds of the registration.", low=1, high=100)
-    spacing_m: float = option(0.004, "Spacing of the surface samples, m.", low=0.001, high=0.05)
+    spacing_m: float = option(0.005, "Spacing of the surface samples, m.", low=0.001, high=0.05)
     fit_m: float = option(
         0.007, "Radius of the local fit of a sample to all views, m.", low=0.002, high=0.05
     )
-    link_m: float = option(0.0088, "Longest link between samples, m.", low=0.002, high=0.1)
+    link_m: float = option(0.011, "Longest link between samples, m.", low=0.002, high=0.1)
     step_m: float = option(
         0.00055, "Largest step between linked samples, along their normal, m.", low=1e-5, high=0.02
     )
@@ -569,12 +569,6 @@ class RotationConfig(Checked):
         low=1e-6,
         high=0.1,
     )
-    piece: float = option(
-        0.05,
-        "Least share of the surface for a piece apart to be joined again.",
-        low=0.001,
-        high=1.0,
-    )
     rim_length_m: float = option(
         0.12, "Length of rim that must agree for two pieces to be joined, m.", low=0.02, high=10.0
     )
@@ -583,6 +577,13 @@ class RotationConfig(Checked):
         "Which samples of the surface to begin with, of many alike; others show what is chance.",
         low=0,
         high=100000,
+    )
+    ways: int = option(
+        8,
+        "Most ways to lay the item flat that are tried; with fewer, hard items come out sooner, "
+        "and more of them unknown or not to be trusted.",
+        low=1,
+        high=8,
     )
     landmarks: int = option(300, "Samples whose mutual distances are unfolded.", low=50, high=5000)
     local_m: float = option(

@@ -262,6 +262,14 @@ def pieces(a: Int, b: Int, passable: Bool) -> Int:
     return label
 
 
+def largest_pieces(links: Links, passable: Bool, least: int) -> list[Bool]:
+    """Masks (n,) of the pieces with more samples than `least`, largest first."""
+    piece = pieces(links.a, links.b, passable)
+    size = np.bincount(piece[passable], minlength=1)
+    order = np.argsort(-size, kind="stable")
+    return [passable & (piece == k) for k in order if size[k] > least]
+
+
 def _nearest(paths: csr_matrix, count: int) -> Int:
     """(n, count) landmarks nearest to each sample; -1 where fewer are near."""
     by_sample = paths.tocsc()

@@ -14,8 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.distances import link_distances, surface_distances
-from vflatten_ros.core.joining import largest_pieces
+from vflatten_ros.core.distances import largest_pieces, link_distances, surface_distances
 from vflatten_ros.core.puzzle import CELL_M as PUZZLE_CELL_M
 from vflatten_ros.core.puzzle import Motion, Ties, put_together
 from vflatten_ros.core.rotation import (

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from vflatten_ros.core.config import Config
+from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.grouping import (
     CLOSED,
@@ -47,9 +47,11 @@ WAYS = (  # draw of the samples, how, greatest doubt
     (0, CLOSED, 1.0),
     (1, CLOSED, 1.0),
 )
+FINER = 0.8  # spacing of the samples drawn again, in that of the first
 ENOUGH = -0.05  # badness below which no further way is tried
-DISPUTED = -0.5  # the same if it is unsure, or another way not much worse has another category
-RIVAL = 1.5  # how much worse it may be
+DISPUTED = -0.5  # the same if it is unsure, or ways not much worse have another category
+RIVAL = 1.5  # how much worse they may be
+MAJORITY = 3  # ways of the best one's category for each such, for them not to count
 UNDECIDED = 0.9  # probability of the best way's category below which it is unsure
 NEAR_TIE = 0.15  # by how much, for the result not to be trusted
 SURE = 0.97  # probability of a category below which one way alone is not believed
@@ -74,6 +76,7 @@ class Tried:
     found: Recognition
     aside: float = 0.0  # share of the samples in large groups that were left out
     rival: str = ""  # another category that is nearly as good in another way
+    rotation: RotationConfig = RotationConfig()  # by which it was laid flat
 
     @property
     def badness(self) -> float:
@@ -125,12 +128,11 @@ def likeliest(
     tries: list[Tried] = []
     failures: list[DisconnectedSurface] = []
     draws: dict[int, _Draw] = {}
-    for draw, how, doubt in WAYS:
+    for draw, how, doubt in WAYS[: config.rotation.ways]:
         if settled(tries):
             break
         if draw not in draws:
-            again = drawn_again(fused, draw, config.rotation, progress) if draw else fused
-            draws[draw] = _Draw(again, templates, config, progress)
+            draws[draw] = _Draw(fused, draw, templates, config, progress)
         try:
             tries.append(draws[draw].tried(how, doubt))
         except DisconnectedSurface as error:
@@ -140,12 +142,19 @@ def likeliest(
     return replace(_best(tries), rival=rival(tries, NEAR_TIE))
 
 
+def finer(config: RotationConfig) -> RotationConfig:
+    """The same for a denser draw of the samples: it sees other places where layers touch."""
+    return replace(config, spacing_m=FINER * config.spacing_m, link_m=FINER * config.link_m)
+
+
 def settled(tries: Sequence[Tried]) -> bool:
     """Whether what was tried is good enough, undisputed, and one way alone beyond doubt."""
     if not tries:
         return False
     best = _best(tries)
-    disputed = bool(rival(tries, RIVAL)) or best.sure < UNDECIDED
+    near, against = _near(tries, RIVAL), _rivals(tries, RIVAL)
+    agreed = len(near) - len(against) >= MAJORITY * len(against)
+    disputed = not agreed or best.sure < UNDECIDED
     if best.badness >= (DISPUTED if disputed else ENOUGH):
         return False
     unseen = float(tries[0].unfolded.outline.inferred.mean())
@@ -154,11 +163,21 @@ def settled(tries: Sequence[Tried]) -> bool:
 
 def rival(tries: Sequence[Tried], margin: float) -> str:
     """Another category than the best way's, of a way that is less than a margin worse; or none."""
-    best = _best(tries)
-    known = (UNKNOWN, best.found.category)
-    others = [one for one in tries if one.found.category not in known]
-    near = [one for one in others if one.badness < best.badness + margin]
-    return _best(near).found.category if near else ""
+    rivals = _rivals(tries, margin)
+    return _best(rivals).found.category if rivals else ""
+
+
+def _near(tries: Sequence[Tried], margin: float) -> list[Tried]:
+    """Ways to a category, the best and those that are less than a margin worse."""
+    least = _best(tries).badness
+    known = [one for one in tries if one.found.category != UNKNOWN]
+    return [one for one in known if one.badness < least + margin]
+
+
+def _rivals(tries: Sequence[Tried], margin: float) -> list[Tried]:
+    """Those of them to another category than the best way's."""
+    category = _best(tries).found.category
+    return [one for one in _near(tries, margin) if one.found.category != category]
 
 
 def _best(tries: Sequence[Tried]) -> Tried:
@@ -171,10 +190,14 @@ class _Draw:
     def __init__(
         self,
         fused: Fused,
+        draw: int,
         templates: tuple[Template, ...],
         config: Config,
         progress: Progress,
     ) -> None:
+        if draw:
+            config = replace(config, rotation=finer(config.rotation))
+            fused = drawn_again(fused, draw, config.rotation, progress)
         self._fused = fused
         self._templates, self._config, self._progress = templates, config, progress
         self._grouped: dict[float, Grouped] = {}
@@ -194,8 +217,7 @@ class _Draw:
         """
         config, progress = self._config, self._progress
         if how == WHOLE:
-            surface = self._doubted if np.isfinite(doubt) else self._linked
-            unfolded = unfold_surface(surface, doubt, config.rotation, progress)
+            unfolded = unfold_surface(self._linked, config.rotation, progress)
             return _recognised(unfolded, self._templates, config, progress)
         if doubt not in self._grouped:
             self._grouped[doubt] = group_pieces(self._doubted, doubt, config.rotation, progress)
@@ -249,4 +271,4 @@ def _recognised(
 ) -> Tried:
     outline, points = unfolded.outline, unfolded.points
     found = recognise(outline, points, templates, config.recognition, progress, begin)
-    return Tried(unfolded, found)
+    return Tried(unfolded, found, rotation=config.rotation)

@@ -156,6 +156,7 @@ def _rotation(
     config = replace(config, rotation=suited(config.rotation, fused.grain))
     given, told = fused.given, fused.notices + fused.given.notices
     best = likeliest(fused, tuple(templates), config, progress)
+    config = replace(config, rotation=best.rotation)
     del fused  # its points are many
     unfolded, found = best.unfolded, best.found
     turn, turns = 0, TURNS if found.category != UNKNOWN else 0

@@ -20,7 +20,7 @@ from vflatten_ros.core.partial_match import matches
 from vflatten_ros.core.puzzle import Complex, Motion
 from vflatten_ros.core.template_fit import place, refine
 from vflatten_ros.core.templates import Template
-from vflatten_ros.core.values import FlatPoints, Float, Outline, Progress, no_progress
+from vflatten_ros.core.values import FlatPoints, Float, Int, Outline, Progress, no_progress
 
 MOST = 120  # ends of a group, and points inside, that are judged
 CELL_M = 0.004  # of the images that judge a place
@@ -80,6 +80,13 @@ class _Images:
     low: Float  # (2,)
     signed: Float  # distance to the category's outline, inside negative, m
     taken: tuple[Float, Float]  # depth in what lies there outside up, and down, m
+
+    def cells(self, uv: Float) -> Int:
+        """(...) numbers of the cells at (..., 2) places, or nearest to them."""
+        rows, cols = self.signed.shape
+        at = np.rint((uv - self.low) / CELL_M).astype(np.int64)
+        cell: Int = at[..., 1].clip(0, rows - 1) * cols + at[..., 0].clip(0, cols - 1)
+        return cell
 
 
 STAYS = Motion(False, 1.0, 0.0)
@@ -236,25 +243,14 @@ def _costs(
         return np.stack([out.real, out.imag], axis=-1)
 
     sigma = config.misfit_m
-    inner = moved(shape.inner)
-    off = _look_up(images.low, images.signed, moved(shape.ends)) / sigma
-    out = np.maximum(_look_up(images.low, images.signed, inner), 0.0) / sigma
+    inner = images.cells(moved(shape.inner))
+    off = images.signed.take(images.cells(moved(shape.ends))) / sigma
+    out = np.maximum(images.signed.take(inner), 0.0) / sigma
     up = np.where(mirrored[:, None], -shape.up, shape.up)
-    depth = np.where(
-        up > 0,
-        _look_up(images.low, images.taken[0], inner),
-        _look_up(images.low, images.taken[1], inner),
-    )
+    depth = np.where(up > 0, images.taken[0].take(inner), images.taken[1].take(inner))
     over = np.maximum(depth - config.overlap_m, 0.0) * (up != 0) / sigma
     fit = config.end_weight * robust_mean(off, 3.0) + config.inner_weight * robust_mean(out, 3.0)
     return np.stack([fit, config.overlap_weight * robust_mean(over, 6.0)])
-
-
-def _look_up(low: Float, image: Float, uv: Float) -> Float:
-    at = np.rint((uv - low) / CELL_M).astype(np.int64)
-    rows, cols = image.shape
-    out: Float = image[np.clip(at[..., 1], 0, rows - 1), np.clip(at[..., 0], 0, cols - 1)]
-    return out
 
 
 def _images(

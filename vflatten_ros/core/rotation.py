@@ -26,7 +26,6 @@ from vflatten_ros.core.geometry import (
     twice_area,
 )
 from vflatten_ros.core.grain import Grain, notices_of, suited, typical
-from vflatten_ros.core.joining import agreeing, find_ties, largest_pieces, near_paths
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.puzzle import overlap as lying_on
 from vflatten_ros.core.ramps import ramps
@@ -65,11 +64,10 @@ SPUR_M = 0.012  # half the width of what is too narrow for a garment
 SPUR_REACH = 0.8  # how far a corner goes beyond a disc in it, in radii
 ROUGH, ROUGH_ROUNDS = 120, 4  # landmarks and reweightings where pieces are laid flat by themselves
 FEWEST, ROUGH_SPACING = 50, 40  # landmarks of a small piece, and samples for each
-MOST_JOINS = 3
 MOST_DOUBTFUL = 0.1  # of the samples, at a doubt of 1
 TOLD_M = 1e-4  # length of a link between samples that are said to be one point of the cloth
 TOLD_AMONG = 8  # samples nearest to such a point, of which the nearest that faces its way is it
-CUT_M = 0.008  # between points of one slit
+CUT = 2.0  # spacings between points of one slit
 WITHIN = 0.5  # share of a group's points in the outline, below which it lies apart
 DEEP_M = 0.020  # how deep within the outline a slit lies, by the middle of its points
 SLIT_M = 0.03  # widest slit of which one side tells what the other is
@@ -144,25 +142,18 @@ class Unfolded:
 
 
 def unfold_surface(
-    surface: Surface, doubt: float, config: RotationConfig, progress: Progress = no_progress
+    surface: Surface, config: RotationConfig, progress: Progress = no_progress
 ) -> Unfolded:
-    """Flatten the surface, front and back, without going through doubtful places where it can.
-
-    Parameters
-    ----------
-    surface : Surface
-    doubt : float
-        What is more doubtful than this is passed only where pieces are joined.
+    """Flatten all that hangs together, front and back.
 
     Raises
     ------
     DisconnectedSurface
     """
-    progress("join", 0.0)
-    passable, links = _joined(surface, doubt, config, progress)
     samples = surface.samples
+    everywhere = np.ones(len(samples.xyz), dtype=bool)
     distances = surface_distances(
-        samples.xyz, samples.normal, links, passable, config, progress, surface.steps
+        samples.xyz, samples.normal, surface.links, everywhere, config, progress, surface.steps
     )
     plane = unfold(distances.bound_m, distances.same_sheet, config, progress)
     progress("outline", 0.0)
@@ -227,37 +218,6 @@ def together(
         folded,
         tuple(notices.values()),
     )
-
-
-def _joined(
-    surface: Surface, doubt: float, config: RotationConfig, progress: Progress
-) -> tuple[Bool, Links]:
-    """Samples to go through and links to go along, with the pieces of the surface joined."""
-    samples, links = surface.samples, surface.links
-    passable = passable_at(surface, doubt)
-    keep = links.doubt < doubt
-    least = int(config.piece * len(samples.xyz))
-
-    def joining(_: str, fraction: float) -> None:
-        progress("join", (done + 0.5 * fraction) / MOST_JOINS)
-
-    for done in range(MOST_JOINS):
-        progress("join", done / MOST_JOINS)
-        found = largest_pieces(links.part(keep), passable, least)
-        if len(found) < 2:
-            break
-        ties = find_ties(links, *found[:2])
-        rest = links.part(keep)
-        ends = [laid_flat(surface, rest, piece, config, joining) for piece in found[:2]]
-        one, other = ends[0][ties.one], ends[1][ties.other]
-        placed = np.flatnonzero(np.isfinite(one).all(1) & np.isfinite(other).all(1))
-        met = placed[agreeing(one[placed], other[placed], ties.length_m[placed])]
-        if not len(met):
-            break
-        near = near_paths(samples.xyz, ties.along(met))
-        passable = passable | near
-        keep = keep | (near[links.a] & near[links.b])
-    return passable, links.part(keep)
 
 
 def passable_at(surface: Surface, doubt: float) -> Bool:
@@ -534,7 +494,7 @@ def _outline(
     order = np.argsort(row)
     links = surface.links.among(laid)
     links = replace(links, a=order[links.a], b=order[links.b])
-    cuts = slits(points.uv, side, edge, links)
+    cuts = slits(points.uv, side, edge, links, config)
     return outline_of(points.uv[firm], points.sigma_m[firm], edge[firm], config, cuts)
 
 
@@ -564,7 +524,8 @@ def outline_of(
     inside = (density > config.edge_density * single).astype(np.uint8)
     gap = round(config.close_m / CELL_M)
     inside = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, _disc(gap))
-    inside = _cut(inside, [(cut - low) / CELL_M for cut in cuts])
+    reach = round(CUT * config.spacing_m / CELL_M)
+    inside = _cut(inside, [(cut - low) / CELL_M for cut in cuts], reach)
     inside = _without_spurs(inside, round(SPUR_M / CELL_M))
     contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -590,8 +551,8 @@ def _within(uv: Float, outline: Float) -> Bool:
     return found
 
 
-def _cut(inside: NDArray[np.uint8], cuts: Sequence[Float]) -> NDArray[np.uint8]:
-    """Without thin lines through points (col, row) that lead into the item."""
+def _cut(inside: NDArray[np.uint8], cuts: Sequence[Float], reach: int) -> NDArray[np.uint8]:
+    """Without thin lines through points (col, row), a few cells apart, that lead into the item."""
     depth = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_5) * CELL_M
     into = []
     for cut in cuts:
@@ -600,7 +561,7 @@ def _cut(inside: NDArray[np.uint8], cuts: Sequence[Float]) -> NDArray[np.uint8]:
             into.append(cell)
     if not into:
         return inside
-    points, reach = np.vstack(into), round(CUT_M / CELL_M)
+    points = np.vstack(into)
     drawn = np.zeros_like(inside)
     drawn[points[:, 1], points[:, 0]] = 1
     border = cv2.dilate(inside, np.ones((3, 3), np.uint8)) & ~inside & 1

@@ -6,25 +6,27 @@ the way along the cloth from one leg to the other goes round the end of the slit
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.distances import pieces
 from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.values import Bool, Float, Int
 
-BESIDE_M = 0.008  # between the two sides of a slit, most of which is closed
-WIDE_M = 0.016  # where it opens
-WAY = 6  # links from one side to the other, round a hole in what was seen
+BESIDE = 2.0  # spacings between the two sides of a slit, most of which is closed
+WIDE = 4.0  # where it opens
+WAY_M = 0.053  # over links from one side to the other, round a hole in what was seen
 LONG_M = 0.06  # shortest slit
-STEP_M = 0.004  # along a slit, for each of the points that tell of it
-AWAY_M = 0.012  # from the middle of a slit, where another layer may go on across it
-THIN_M = 0.0025  # standard deviation across a slit: straight, as what is torn by noise is not
+AWAY = 3.0  # spacings from the middle of a slit, where another layer may go on across it
+THIN = 0.625  # standard deviation across a slit: straight, as what is torn by noise is not
 CROSSED = 0.5  # share of a slit that another layer crosses, for the item to have none there
 
 
-def slits(uv: Float, side: Float, edge: Int, links: Links) -> list[Float]:
+def slits(uv: Float, side: Float, edge: Int, links: Links, config: RotationConfig) -> list[Float]:
     """Points along slits, and along edges that look like one: the sides of a rim, for one.
 
     Parameters
@@ -37,6 +39,8 @@ def slits(uv: Float, side: Float, edge: Int, links: Links) -> list[Float]:
         Above 0 where what was seen of a sheet ends.
     links : Links
         Between the samples.
+    config : RotationConfig
+        How far apart samples are, and how far links reach.
 
     Returns
     -------
@@ -45,55 +49,88 @@ def slits(uv: Float, side: Float, edge: Int, links: Links) -> list[Float]:
         without a way from one to the other of a few links.
     """
     ends = np.flatnonzero((edge > 0) & (side != 0))
-    linked = _linked(links.part(~links.rim), len(uv))
-    i, j = _torn(uv, side, ends, BESIDE_M, linked)
+    laid = _Laid(uv, side, _linked(links.part(~links.rim), len(uv)), config)
+    i, j = _torn(laid, ends, BESIDE * laid.spacing_m)
     middle = (uv[i] + uv[j]) / 2
-    label = _stretches(middle)
-    long = np.bincount(label) * STEP_M > LONG_M  # fewer points than that cannot be
+    label = _stretches(middle, laid)
+    long = np.bincount(label) * laid.spacing_m > LONG_M  # fewer points than that cannot be
     found = []
     for k in np.flatnonzero(long):
         own = label == k
         line = middle[own]
         if np.ptp(line, axis=0).max() < LONG_M:
             continue
-        centre = line.mean(axis=0)
-        thickness, across = (x[-1] for x in np.linalg.svd(line - centre, full_matrices=False)[1:])
-        if thickness > THIN_M * np.sqrt(len(line)):
+        centre, across, thickness = _straight(line)
+        if thickness > THIN * laid.spacing_m:
             continue
-        if _crossed(uv, side, i[own], j[own], linked).mean() < CROSSED:
-            found.append(_widened(line, centre, across, uv, side, ends, linked))
+        if _crossed(laid, i[own], j[own]).mean() < CROSSED:
+            found.append(_widened(laid, line, centre, across, ends))
     return found
 
 
-def _widened(
-    line: Float, centre: Float, across: Float, uv: Float, side: Float, ends: Int, linked: csr_matrix
-) -> Float:
+def _straight(line: Float) -> tuple[Float, Float, float]:
+    """Middle of (m, 2) points along a line, the unit vector across, their deviation from it.
+
+    Strays beside a slit hang on it here and there: the deviation is that of most points.
+    """
+    core = line
+    for _ in range(2):
+        centre = core.mean(axis=0)
+        across = np.linalg.svd(core - centre, full_matrices=False)[2][-1]
+        off = (line - centre) @ across
+        off -= np.median(off)
+        deviation = min(1.4826 * float(np.median(np.abs(off))), float(off.std()))
+        core = line[np.abs(off) <= 3.0 * deviation]
+    return centre, across, deviation
+
+
+@dataclass(frozen=True, eq=False)
+class _Laid:
+    """Samples as they lie flat."""
+
+    uv: Float  # (n, 2)
+    side: Float  # (n,)
+    linked: csr_matrix  # (n, n) along the sheet
+    config: RotationConfig
+
+    @property
+    def spacing_m(self) -> float:
+        return self.config.spacing_m
+
+    @property
+    def way(self) -> int:
+        """Links that a way round a hole has at most."""
+        return max(2, round(WAY_M / self.config.link_m))
+
+
+def _widened(laid: _Laid, line: Float, centre: Float, across: Float, ends: Int) -> Float:
     """A slit with what it goes on to where its sides are farther apart."""
-    straight = ends[np.abs((uv[ends] - centre) @ across) < WIDE_M]
-    i, j = _torn(uv, side, straight, WIDE_M, linked)
+    uv, wide_m = laid.uv, WIDE * laid.spacing_m
+    straight = ends[np.abs((uv[ends] - centre) @ across) < wide_m]
+    i, j = _torn(laid, straight, wide_m)
     middle = (uv[i] + uv[j]) / 2
-    middle = middle[np.abs((middle - centre) @ across) < AWAY_M / 2]
-    stretch = _stretches(middle)
+    middle = middle[np.abs((middle - centre) @ across) < AWAY / 2 * laid.spacing_m]
+    stretch = _stretches(middle, laid)
     wide: Float = middle[np.isin(stretch, stretch[cKDTree(middle).query(line)[1]])]
     return wide
 
 
-def _torn(uv: Float, side: Float, ends: Int, most_m: float, linked: csr_matrix) -> tuple[Int, Int]:
+def _torn(laid: _Laid, ends: Int, most_m: float) -> tuple[Int, Int]:
     """Pairs of some samples of one side that lie side by side and do not hang together."""
     if not len(ends):
         return ends, ends
-    i, j = ends[cKDTree(uv[ends]).query_pairs(most_m, output_type="ndarray")].T
-    alike = side[i] == side[j]
+    i, j = ends[cKDTree(laid.uv[ends]).query_pairs(most_m, output_type="ndarray")].T
+    alike = laid.side[i] == laid.side[j]
     i, j = i[alike], j[alike]
-    for way in (2, WAY):  # most of them are neighbours
-        far = ~_joined_within(way, i, j, linked)
+    for way in (2, laid.way):  # most of them are neighbours
+        far = ~_joined_within(way, i, j, laid.linked)
         i, j = i[far], j[far]
     return i, j
 
 
-def _stretches(points: Float) -> Int:
+def _stretches(points: Float, laid: _Laid) -> Int:
     """Number of the stretch that each of (m, 2) points belongs to."""
-    i, j = cKDTree(points).query_pairs(BESIDE_M, output_type="ndarray").T
+    i, j = cKDTree(points).query_pairs(BESIDE * laid.spacing_m, output_type="ndarray").T
     return pieces(i, j, np.ones(len(points), dtype=bool))
 
 
@@ -116,10 +153,11 @@ def _joined_within(way: int, i: Int, j: Int, linked: csr_matrix) -> Bool:
     return joined
 
 
-def _crossed(uv: Float, side: Float, i: Int, j: Int, linked: csr_matrix) -> Bool:
+def _crossed(laid: _Laid, i: Int, j: Int) -> Bool:
     """Whether cloth of the other side runs across between (m,) pairs."""
+    uv, side, away_m = laid.uv, laid.side, AWAY * laid.spacing_m
     middle, over = (uv[i] + uv[j]) / 2, uv[j] - uv[i]
-    over *= AWAY_M / np.maximum(np.linalg.norm(over, axis=1, keepdims=True), 1e-9)
+    over *= away_m / np.maximum(np.linalg.norm(over, axis=1, keepdims=True), 1e-9)
     crossed = np.zeros(len(i), dtype=bool)
     for up in (-1.0, 1.0):
         mine, theirs = np.flatnonzero(side[i] == up), np.flatnonzero(side == -up)
@@ -127,10 +165,10 @@ def _crossed(uv: Float, side: Float, i: Int, j: Int, linked: csr_matrix) -> Bool
             continue
         tree = cKDTree(uv[theirs])
         one, other = (
-            tree.query(middle[mine] + way * over[mine], distance_upper_bound=AWAY_M / 3)[1]
+            tree.query(middle[mine] + way * over[mine], distance_upper_bound=away_m / 3)[1]
             for way in (-1, 1)
         )
         both = (one < len(theirs)) & (other < len(theirs))
         ends = theirs[one[both]], theirs[other[both]]
-        crossed[mine[both]] = _joined_within(WAY, *ends, linked)
+        crossed[mine[both]] = _joined_within(laid.way, *ends, laid.linked)
     return crossed

@@ -169,7 +169,7 @@ class Outline:
 
     uv: Float  # (k, 2), flat frame
     sigma_m: Float  # (k,)
-    inferred: Bool  # (k,) True: no view shows this part; once recognised, it is the category's
+    inferred: Bool  # (k,) True: not seen to end so; once recognised, it is the category's
 
 
 @dataclass(frozen=True, eq=False)

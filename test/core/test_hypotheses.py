@@ -174,6 +174,8 @@ def test_what_is_drawn_again_is_denser_and_flattened_further_as_such(method):
     )
     assert best.found.fit.misfit == -0.5
     assert method.configs == [first, denser]
+    least = hypotheses.finer(RotationConfig(spacing_m=0.001, link_m=0.0021))
+    assert (least.spacing_m, least.link_m) == (0.001, 0.002)
 
 
 def test_no_more_ways_are_tried_than_asked(method):

@@ -7,7 +7,7 @@ item then lies flat, and is one of a kind that exists, can.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -143,8 +143,13 @@ def likeliest(
 
 
 def finer(config: RotationConfig) -> RotationConfig:
-    """The same for a denser draw of the samples: it sees other places where layers touch."""
-    return replace(config, spacing_m=FINER * config.spacing_m, link_m=FINER * config.link_m)
+    """The same for a denser draw of the samples: it sees other places where layers touch.
+
+    No length goes beyond its allowed range.
+    """
+    least = {field.name: field.metadata["low"] for field in fields(config)}
+    lengths = ("spacing_m", "link_m")
+    return replace(config, **{n: max(least[n], FINER * getattr(config, n)) for n in lengths})
 
 
 def settled(tries: Sequence[Tried]) -> bool:

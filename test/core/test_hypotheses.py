@@ -23,9 +23,14 @@ def tried(
     aside=0.0,
     sure=1.0,
     unseen=0.0,
+    strain=0.0,
+    parts=1,
 ):
     outline = SimpleNamespace(inferred=np.arange(100) < 100 * unseen)
-    unfolded = SimpleNamespace(share=share, overlap=overlap, outline=outline)
+    points = SimpleNamespace(stress=np.where(np.arange(1000) < 1000 * strain, 0.002, 0.0005))
+    unfolded = SimpleNamespace(
+        share=share, overlap=overlap, outline=outline, points=points, parts=(None,) * parts
+    )
     found = SimpleNamespace(
         category=category,
         probabilities={"towel": sure, "skirt": 1.0 - sure, "unknown": 0.0},
@@ -44,9 +49,11 @@ def test_all_that_is_wrong_with_a_way_counts():
         tried(misfit=0.2),
         tried(explained=0.7),
         tried(sure=0.5),
+        tried(strain=0.2),
     ]
     assert all(way.badness > good + 0.4 for way in worse)
-    assert tried(share=0.95, overlap=0.04, explained=0.96).badness == good  # as any result has
+    as_any_result_has = tried(share=0.95, overlap=0.04, explained=0.96, strain=0.05)
+    assert as_any_result_has.badness == good
 
 
 def test_a_large_piece_left_aside_is_worse_than_as_many_shreds():
@@ -56,7 +63,7 @@ def test_a_large_piece_left_aside_is_worse_than_as_many_shreds():
 
 def test_a_way_that_fits_nothing_is_the_worst():
     nothing = Tried(
-        SimpleNamespace(share=1.0, overlap=0.0),
+        SimpleNamespace(share=1.0, overlap=0.0, points=SimpleNamespace(stress=np.zeros(9))),
         SimpleNamespace(category="unknown", probabilities={"unknown": 1.0}, fit=None),
     )
     assert nothing.badness == float("inf")
@@ -80,6 +87,12 @@ def test_ways_that_disagree_settle_it_only_if_one_is_much_better():
     assert settled([good, tried(misfit=0.6, category="unknown")])
     assert not settled([tried(misfit=-0.4, sure=0.85), tried(misfit=0.6)])
     assert settled([tried(misfit=-0.7, sure=0.85), tried(misfit=0.6)])
+
+
+def test_groups_that_only_their_category_joins_are_believed_if_they_fit_well():
+    bad = tried(misfit=0.5)
+    assert settled([bad, tried(misfit=-0.3)]) and not settled([bad, tried(misfit=-0.3, parts=2)])
+    assert settled([bad, tried(misfit=-0.6, parts=2)])
 
 
 def test_three_ways_outvote_one_that_disagrees():

@@ -49,8 +49,8 @@ WAYS = (  # draw of the samples, how, greatest doubt
 )
 FINER = 0.8  # spacing of the samples drawn again, in that of the first
 ENOUGH = -0.05  # badness below which no further way is tried
-DISPUTED = -0.5  # the same if it is unsure, or ways not much worse have another category
-RIVAL = 1.5  # how much worse they may be
+DISPUTED = -0.5  # the same if it is unsure, or placed in groups, or another category not much worse
+RIVAL = 1.5  # how much worse ways to other categories may be
 MAJORITY = 3  # ways of the best one's category for each such, for them not to count
 UNDECIDED = 0.9  # probability of the best way's category below which it is unsure
 NEAR_TIE = 0.15  # by how much, for the result not to be trusted
@@ -60,6 +60,8 @@ DOUBTFUL = 0.3  # badness above which a result is not to be trusted
 UNSURE = 0.7  # probability of its category below which it is not, either
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
+STRAINED_M = 0.001  # misfit of the distances at a point that cloth laid flat seldom has
+STRAIN, MOSTLY_STRAINED = 0.06, 0.1  # share of points with more; more that counts as 1
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
 ASIDE = 3.0  # of the share that is left out in large groups, beside: it can be no noise
 WORTH_PLACING = 0.1  # share of the samples of a group
@@ -82,11 +84,14 @@ class Tried:
     def badness(self) -> float:
         """How badly and unsurely a category fits, how far from flat it lies, what is left out.
 
-        A garment laid flat has one layer of either side everywhere; more say that layers were
+        A garment laid flat has one layer of either side everywhere, and distances that agree; where
+        there are more layers, or the distances contradict each other over some area, layers were
         joined that are not. A piece alone may look like a whole item of another kind.
         """
         misfit = self.found.fit.misfit if self.found.fit is not None else np.inf
         folded = max(0.0, self.unfolded.overlap - LAID) / MOSTLY_LAID
+        strain = float((self.unfolded.points.stress > STRAINED_M).mean())
+        folded += max(0.0, strain - STRAIN) / MOSTLY_STRAINED
         left_out = max(0.0, 1.0 - self.unfolded.share - STRAYS) / MOSTLY_LEFT
         explained = self.found.fit.explained if self.found.fit is not None else 0.0
         odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD
@@ -159,7 +164,8 @@ def settled(tries: Sequence[Tried]) -> bool:
     best = _best(tries)
     near, against = _near(tries, RIVAL), _rivals(tries, RIVAL)
     agreed = len(near) - len(against) >= MAJORITY * len(against)
-    disputed = not agreed or best.sure < UNDECIDED
+    placed = len(best.unfolded.parts) > 1  # groups that nothing joins but the category
+    disputed = not agreed or placed or best.sure < UNDECIDED
     if best.badness >= (DISPUTED if disputed else ENOUGH):
         return False
     unseen = float(tries[0].unfolded.outline.inferred.mean())

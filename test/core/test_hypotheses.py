@@ -191,6 +191,22 @@ def test_what_is_drawn_again_is_denser_and_flattened_further_as_such(method):
     assert (least.spacing_m, least.link_m) == (0.001, 0.002)
 
 
+def test_pieces_are_put_together_once_and_let_go_after_their_last_way(monkeypatch, method):
+    together, held = [], []
+    monkeypatch.setattr(hypotheses, "group_pieces", lambda one, *_: together.append(1) or one)
+
+    def from_groups(draw, one, how):
+        held.append(dict(draw._grouped))
+        return tried(misfit=0.5)
+
+    monkeypatch.setattr(hypotheses._Draw, "_from_groups", from_groups)
+    ways = ((0, hypotheses.PUZZLE, 1.0), (0, hypotheses.PUZZLE, 0.4), (0, hypotheses.CLOSED, 1.0))
+    monkeypatch.setattr(hypotheses, "WAYS", ways)
+    hypotheses.likeliest(0, (), Config(), lambda *_: None)
+    assert len(together) == 2
+    assert [set(groups) for groups in held] == [{1.0}, {1.0}, set()]
+
+
 def test_no_more_ways_are_tried_than_asked(method):
     few = replace(Config(), rotation=RotationConfig(ways=3))
     hypotheses.likeliest(0, (), few, lambda *_: None)

@@ -108,7 +108,7 @@ class SegmentationConfig(Checked):
     trim_px: int = option(
         0,
         "Pixels taken off where the item ends or hides itself, for stereo that makes what is in "
-        "front wider by so much: about a third of its block; organised clouds only.",
+        "front wider by so much: up to half the block that it matches; organised clouds only.",
         low=0,
         high=50,
     )

@@ -6,6 +6,7 @@ item then lies flat, and is one of a kind that exists, can.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -212,6 +213,7 @@ class _Draw:
         self._fused = fused
         self._templates, self._config, self._progress = templates, config, progress
         self._grouped: dict[float, Grouped] = {}
+        self._uses = Counter(doubt for k, how, doubt in WAYS if k == draw and how != WHOLE)
         self._linked = link_surface(fused, config.rotation, progress)
 
     @cached_property
@@ -232,7 +234,11 @@ class _Draw:
             return _recognised(unfolded, self._templates, config, progress)
         if doubt not in self._grouped:
             self._grouped[doubt] = group_pieces(self._doubted, doubt, config.rotation, progress)
-        return self._from_groups(self._grouped[doubt], how)
+        grouped = self._grouped[doubt]
+        self._uses[doubt] -= 1
+        if not self._uses[doubt]:
+            del self._grouped[doubt]  # its links are many
+        return self._from_groups(grouped, how)
 
     def _from_groups(self, grouped: Grouped, how: str) -> Tried:
         """The largest group by itself, or with others placed beside it, whichever is better."""

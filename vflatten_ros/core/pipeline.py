@@ -9,9 +9,9 @@ import numpy as np
 
 from vflatten_ros.core.assembly import assemble
 from vflatten_ros.core.automatic_pair import fill_up, flatten_best_pair
+from vflatten_ros.core.category_outline import MOST_DEEP_M, deep_inside_m, with_category
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
-from vflatten_ros.core.filling import MOST_DEEP_M, deep_inside_m, with_category
 from vflatten_ros.core.grain import suited
 from vflatten_ros.core.hypotheses import likeliest
 from vflatten_ros.core.measurement import measure

@@ -17,12 +17,12 @@ from vflatten_ros.core.distances import pieces
 from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.values import Bool, Float, Int
 
-BESIDE = 2.0  # spacings between the two sides of a slit, most of which is closed
-WIDE = 4.0  # where it opens
+BESIDE = 2.0  # between the two sides of a slit, most of which is closed, in spacings of the samples
+WIDE = 4.0  # the same where it opens
 WAY_M = 0.053  # over links from one side to the other, round a hole in what was seen
 LONG_M = 0.06  # shortest slit
-AWAY = 3.0  # spacings from the middle of a slit, where another layer may go on across it
-THIN = 0.625  # standard deviation across a slit: straight, as what is torn by noise is not
+AWAY = 3.0  # from the middle of a slit, where another layer may go on across it, in spacings
+THIN = 0.625  # deviation across a slit, in spacings: straight, as what noise tears is not
 CROSSED = 0.5  # share of a slit that another layer crosses, for the item to have none there
 
 

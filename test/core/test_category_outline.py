@@ -7,8 +7,8 @@ import pytest
 from flat import lying_at
 
 from vflatten_ros.categories import load_templates
+from vflatten_ros.core.category_outline import DEEP_M, deep_inside_m, with_category
 from vflatten_ros.core.config import RecognitionConfig
-from vflatten_ros.core.filling import DEEP_M, deep_inside_m, with_category
 from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.recognition import recognise
 from vflatten_ros.core.values import Outline

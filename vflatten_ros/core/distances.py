@@ -29,7 +29,6 @@ GROUP = 16  # landmarks whose paths are laid out together: bounds the memory
 MEET_AT = 2  # every such sample is one where paths may meet: laid out, they are straight anyhow
 BLOCK = 512  # samples whose nearest landmarks are found together, so that they stay in the cache
 STRAIGHT_LEAST = 0.4  # a chain whose ends are nearer than this share of it tells too little
-ZIGZAG = 1.03  # how much longer paths over links are than the straight lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,26 +230,6 @@ def surface_distances(
         around_sheet,
         inside,
     )
-
-
-def link_distances(links: Links, chosen: Int, count: int, reach_m: float) -> Float:
-    """(k, k) lengths of shortest paths over links between landmarks, far ones over near ones."""
-    a, b, length_m = links.a, links.b, links.length_m
-    both = (np.r_[a, b], np.r_[b, a])
-    graph = csr_matrix((np.r_[length_m, length_m], both), shape=(count, count))
-    link_m = float(length_m.max())
-    paths = [dijkstra(graph, indices=k, limit=(reach_m + link_m) / 2) for k in chosen]
-    near = [np.flatnonzero(np.isfinite(path)) for path in paths]
-    length = np.concatenate([path[at] for path, at in zip(paths, near, strict=True)])
-    length = length.astype(np.float32)
-    ends = np.cumsum([0, *map(len, near)])
-    reached = csr_matrix((length, np.concatenate(near), ends), shape=(len(chosen), count))
-    everywhere = np.ones(count, dtype=bool)
-    one, other, _, path = _meetings(reached, everywhere, reach_m, link_m)
-    local = np.zeros((len(chosen), len(chosen)))
-    local[one, other] = path / ZIGZAG
-    lengths: Float = shortest_path(local, method="D", directed=False)
-    return lengths
 
 
 def pieces(a: Int, b: Int, passable: Bool) -> Int:

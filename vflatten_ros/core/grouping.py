@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.distances import largest_pieces, link_distances, surface_distances
+from vflatten_ros.core.distances import largest_pieces, surface_distances
 from vflatten_ros.core.puzzle import CELL_M as PUZZLE_CELL_M
 from vflatten_ros.core.puzzle import Motion, Ties, put_together
 from vflatten_ros.core.rotation import (
@@ -27,10 +27,9 @@ from vflatten_ros.core.rotation import (
     unfolded_from,
 )
 from vflatten_ros.core.sheets import Links
-from vflatten_ros.core.unfolding import SPREAD, orientation, settle, unfold
+from vflatten_ros.core.unfolding import SPREAD, orientation, settle
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
-PUZZLE, CLOSED = "puzzle", "closed"
 SMALLEST = 0.01  # share of the samples that makes a piece
 SMALL_GROUP, SMALL_LANDMARKS = 0.15, 150
 RIM_SLACK_M = 0.004  # between the two sides of a rim
@@ -44,7 +43,6 @@ class Grouped:
 
     surface: Surface
     links: Links  # on the sheets, and round the rims that join pieces
-    all_links: Links  # round all other rims of one piece, too
     masks: tuple[Bool, ...]  # (n,) samples of each group, largest first
     places: Float  # (n, 2) as the pieces were put together; NaN in none
 
@@ -87,11 +85,9 @@ def group_pieces(
     size = np.bincount(puzzle.group[puzzle.group >= 0])
     order = [k for k in np.argsort(-size, kind="stable") if size[k] > SMALLEST * len(number)]
     masks = tuple(puzzle.group == k for k in order)
-    own = links.rim & (a == b) & (a >= 0)
     return Grouped(
         surface,
         links.part(~links.rim | believed),
-        links.part(~links.rim | believed | own),
         masks,
         np.column_stack([puzzle.z.real, puzzle.z.imag]),
     )
@@ -119,7 +115,6 @@ def _along_agreeing(xyz: Float, ties: Ties, a: Int, b: Int, met: Bool) -> Bool:
 def unfold_group(
     grouped: Grouped,
     which: int,
-    start: str,
     config: RotationConfig,
     progress: Progress = no_progress,
 ) -> Unfolded:
@@ -130,10 +125,6 @@ def unfold_group(
     grouped : Grouped
     which : int
         The group.
-    start : str
-        PUZZLE: begin as the pieces were put together. CLOSED: believe rims of one piece, too, and
-        begin with what all links give, wrong ones as well: it keeps tubes closed that the group's
-        own distances leave open.
 
     Raises
     ------
@@ -143,17 +134,11 @@ def unfold_group(
     samples = surface.samples
     if mask.mean() < SMALL_GROUP:
         config = replace(config, landmarks=min(config.landmarks, SMALL_LANDMARKS))
-    links = grouped.all_links if start == CLOSED else grouped.links
     distances = surface_distances(
-        samples.xyz, samples.normal, links, mask, config, progress, surface.steps
+        samples.xyz, samples.normal, grouped.links, mask, config, progress, surface.steps
     )
     bound, near = distances.bound_m, distances.same_sheet
-    if start == CLOSED:
-        everything = link_distances(surface.links, distances.chosen, len(mask), config.local_m)
-        rough = replace(config, unfold_rounds=max(1, config.unfold_rounds // 2))
-        plane = unfold(np.minimum(everything, bound), near, rough, progress)
-    else:
-        plane = grouped.places[distances.chosen]
+    plane = grouped.places[distances.chosen]  # as the pieces were put together
     plane = settle(plane, bound, near, config, SPREAD[-1])
     progress("outline", 0.0)
     return unfolded_from(surface, Part(distances, plane), config)

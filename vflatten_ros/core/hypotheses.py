@@ -6,23 +6,16 @@ item then lies flat, and is one of a kind that exists, can.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 
+from vflatten_ros.core.category_outline import MOST_DEEP_M, deep_inside_m
 from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
-from vflatten_ros.core.grouping import (
-    CLOSED,
-    PUZZLE,
-    Grouped,
-    group_pieces,
-    put_beside,
-    unfold_group,
-)
+from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold_group
 from vflatten_ros.core.placing import Group, place_groups
 from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
 from vflatten_ros.core.rotation import (
@@ -37,33 +30,33 @@ from vflatten_ros.core.rotation import (
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import Float, Progress
 
-WHOLE = "whole"
-WAYS = (  # draw of the samples, how, greatest doubt
-    (0, WHOLE, np.inf),
-    (0, PUZZLE, 1.0),
-    (1, WHOLE, np.inf),
-    (1, PUZZLE, 1.0),
-    (0, PUZZLE, 0.4),
-    (1, PUZZLE, 0.4),
-    (0, CLOSED, 1.0),
-    (1, CLOSED, 1.0),
+WHOLE = np.inf  # the doubt at which all links are believed
+WAYS = (  # draw of the samples, greatest doubt of what joins pieces
+    (0, WHOLE),
+    (0, 1.0),
+    (0, 0.4),
+    (1, WHOLE),
+    (1, 0.4),
+    (1, 1.0),
 )
 FINER = 0.8  # spacing of the samples drawn again, in that of the first
-ENOUGH = -0.05  # badness below which no further way is tried
-DISPUTED = -0.5  # the same if it is unsure, or placed in groups, or another category not much worse
+DISPUTED = -0.5  # badness below which a way that is unsure, placed in groups, or not much better
+YIELDING = 0.15  # than another category settles it; the third way and each further one raise it
 RIVAL = 1.5  # how much worse ways to other categories may be
-MAJORITY = 3  # ways of the best one's category for each such, for them not to count
+MAJORITY = 2  # ways of the best one's category for each such, for them not to count
 UNDECIDED = 0.9  # probability of the best way's category below which it is unsure
-NEAR_TIE = 0.15  # by how much, for the result not to be trusted
+VOTE = 2.0  # by how many e-folds a way counts less if it is worse by 1
+NEAR_TIE = 0.67  # share of the best category's votes, for the result not to be trusted
 SURE = 0.97  # probability of a category below which one way alone is not believed
 MOST_UNSEEN = 0.15  # share of the outline that no view shows, above which it is not, either
-DOUBTFUL = 0.3  # badness above which a result is not to be trusted
+DOUBTFUL = 0.3  # badness above which a result is not to be trusted, and more ways are tried
 UNSURE = 0.7  # probability of its category below which it is not, either
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 STRAINED_M = 0.001  # misfit of the distances at a point that cloth laid flat seldom has
 STRAIN, MOSTLY_STRAINED = 0.06, 0.1  # share of points with more; more that counts as 1
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
+ODD = 0.5  # for a long stretch of the outline deep inside the category's
 ASIDE = 3.0  # of the share that is left out in large groups, beside: it can be no noise
 WORTH_PLACING = 0.1  # share of the samples of a group
 HOPELESS = 0.8  # misfit of the largest group, above which none is: that group is laid out wrong
@@ -78,8 +71,15 @@ class Tried:
     unfolded: Unfolded
     found: Recognition
     aside: float = 0.0  # share of the samples in large groups that were left out
-    rival: str = ""  # another category that is nearly as good in another way
+    rival: str = ""  # another category for which other ways speak nearly as much
     rotation: RotationConfig = RotationConfig()  # by which it was laid flat
+
+    @cached_property
+    def deep_m(self) -> float:
+        """Longest stretch of the outline that was seen deep inside the category's, m."""
+        if self.found.fit is None:
+            return 0.0
+        return deep_inside_m(self.unfolded.outline, self.found.fit)
 
     @property
     def badness(self) -> float:
@@ -96,6 +96,8 @@ class Tried:
         left_out = max(0.0, 1.0 - self.unfolded.share - STRAYS) / MOSTLY_LEFT
         explained = self.found.fit.explained if self.found.fit is not None else 0.0
         odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD
+        if self.found.fit is not None and self.deep_m > MOST_DEEP_M:
+            odd += ODD
         left_out += ASIDE * self.aside
         unknown = float(self.found.category == UNKNOWN)
         return float(misfit + folded + left_out + odd + 1.0 - self.sure + unknown)
@@ -114,7 +116,7 @@ class Tried:
         if self.sure < UNSURE:
             return f"it is only {self.sure:.0%} likely to be what it most looks like"
         if self.rival:
-            return f"laid flat in another way it is nearly as good a {self.rival}"
+            return f"laid flat in other ways it is nearly as good a {self.rival}"
         return ""
 
 
@@ -134,18 +136,18 @@ def likeliest(
     tries: list[Tried] = []
     failures: list[DisconnectedSurface] = []
     draws: dict[int, _Draw] = {}
-    for draw, how, doubt in WAYS[: config.rotation.ways]:
+    for draw, doubt in WAYS[: config.rotation.ways]:
         if settled(tries):
             break
         if draw not in draws:
             draws[draw] = _Draw(fused, draw, templates, config, progress)
         try:
-            tries.append(draws[draw].tried(how, doubt))
+            tries.append(draws[draw].tried(doubt))
         except DisconnectedSurface as error:
             failures.append(error)
     if not tries:
         raise failures[0]
-    return replace(_best(tries), rival=rival(tries, NEAR_TIE))
+    return replace(_best(tries), rival=rival(tries))
 
 
 def finer(config: RotationConfig) -> RotationConfig:
@@ -163,37 +165,43 @@ def settled(tries: Sequence[Tried]) -> bool:
     if not tries:
         return False
     best = _best(tries)
-    near, against = _near(tries, RIVAL), _rivals(tries, RIVAL)
-    agreed = len(near) - len(against) >= MAJORITY * len(against)
+    near = [one for one in tries if one.badness < best.badness + RIVAL]
+    near = [one for one in near if one.found.category != UNKNOWN]
+    against = sum(one.found.category != best.found.category for one in near)
+    agreed = len(near) - against >= MAJORITY * against
     placed = len(best.unfolded.parts) > 1  # groups that nothing joins but the category
     disputed = not agreed or placed or best.sure < UNDECIDED
-    if best.badness >= (DISPUTED if disputed else ENOUGH):
+    limit = DISPUTED + YIELDING * max(0, len(tries) - 2) if disputed else DOUBTFUL
+    if best.badness >= limit:
         return False
     unseen = float(tries[0].unfolded.outline.inferred.mean())
     return len(tries) > 1 or (tries[0].sure >= SURE and unseen < MOST_UNSEEN)
 
 
-def rival(tries: Sequence[Tried], margin: float) -> str:
-    """Another category than the best way's, of a way that is less than a margin worse; or none."""
-    rivals = _rivals(tries, margin)
-    return _best(rivals).found.category if rivals else ""
+def rival(tries: Sequence[Tried]) -> str:
+    """Another category that has nearly as many votes as the best way's; or none."""
+    votes = _votes(tries)
+    mine = votes.pop(_best(tries).found.category)
+    votes.pop(UNKNOWN, None)
+    other = max(votes, key=lambda name: votes[name], default="")
+    return other if other and votes[other] > NEAR_TIE * mine else ""
 
 
-def _near(tries: Sequence[Tried], margin: float) -> list[Tried]:
-    """Ways to a category, the best and those that are less than a margin worse."""
-    least = _best(tries).badness
-    known = [one for one in tries if one.found.category != UNKNOWN]
-    return [one for one in known if one.badness < least + margin]
-
-
-def _rivals(tries: Sequence[Tried], margin: float) -> list[Tried]:
-    """Those of them to another category than the best way's."""
-    category = _best(tries).found.category
-    return [one for one in _near(tries, margin) if one.found.category != category]
+def _votes(tries: Sequence[Tried]) -> dict[str, float]:
+    """How much speaks for each category: the better a way to it, and the more ways, the more."""
+    least = min(one.badness for one in tries)
+    votes: dict[str, float] = {}
+    for one in tries:
+        vote = 1.0 if one.badness == least else float(np.exp(VOTE * (least - one.badness)))
+        votes[one.found.category] = votes.get(one.found.category, 0.0) + vote
+    return votes
 
 
 def _best(tries: Sequence[Tried]) -> Tried:
-    return min(tries, key=lambda tried: tried.badness)
+    """The best way to the category with most votes."""
+    votes = _votes(tries)
+    category = max(votes, key=lambda name: votes[name])
+    return min((t for t in tries if t.found.category == category), key=lambda t: t.badness)
 
 
 class _Draw:
@@ -212,8 +220,6 @@ class _Draw:
             fused = drawn_again(fused, draw, config.rotation, progress)
         self._fused = fused
         self._templates, self._config, self._progress = templates, config, progress
-        self._grouped: dict[float, Grouped] = {}
-        self._uses = Counter(doubt for k, how, doubt in WAYS if k == draw and how != WHOLE)
         self._linked = link_surface(fused, config.rotation, progress)
 
     @cached_property
@@ -221,7 +227,7 @@ class _Draw:
         doubt = doubts(self._fused, self._config.rotation, self._progress)
         return replace(self._linked, doubt=doubt)
 
-    def tried(self, how: str, doubt: float) -> Tried:
+    def tried(self, doubt: float) -> Tried:
         """One of WAYS.
 
         Raises
@@ -229,27 +235,21 @@ class _Draw:
         DisconnectedSurface
         """
         config, progress = self._config, self._progress
-        if how == WHOLE:
+        if doubt == WHOLE:
             unfolded = unfold_surface(self._linked, config.rotation, progress)
             return _recognised(unfolded, self._templates, config, progress)
-        if doubt not in self._grouped:
-            self._grouped[doubt] = group_pieces(self._doubted, doubt, config.rotation, progress)
-        grouped = self._grouped[doubt]
-        self._uses[doubt] -= 1
-        if not self._uses[doubt]:
-            del self._grouped[doubt]  # its links are many
-        return self._from_groups(grouped, how)
+        return self._from_groups(group_pieces(self._doubted, doubt, config.rotation, progress))
 
-    def _from_groups(self, grouped: Grouped, how: str) -> Tried:
+    def _from_groups(self, grouped: Grouped) -> Tried:
         """The largest group by itself, or with others placed beside it, whichever is better."""
         config, progress = self._config, self._progress
-        laid = [unfold_group(grouped, 0, how, config.rotation, progress)]
+        laid = [unfold_group(grouped, 0, config.rotation, progress)]
         alone = _recognised(laid[0], self._templates, config, progress)
         large = [k for k, mask in enumerate(grouped.masks) if k and mask.mean() > WORTH_PLACING]
         alone = replace(alone, aside=sum(float(grouped.masks[k].mean()) for k in large))
         if not large or alone.found.fit is None or alone.found.fit.misfit > HOPELESS:
             return alone
-        laid += [unfold_group(grouped, k, how, config.rotation, progress) for k in large]
+        laid += [unfold_group(grouped, k, config.rotation, progress) for k in large]
         groups = [Group(one.points, one.side, one.outline) for one in laid]
         placings = place_groups(groups, self._templates, config, progress)
         least = placings[0].cost
@@ -265,7 +265,7 @@ class _Draw:
             begin = {only.category: (placing.pose, only.state_of(placing.template, placing.state))}
             tried = _recognised(beside, (only,), config, progress, begin)
             tries.append(replace(tried, found=_among(tried.found, odds)))
-        return _best(tries)
+        return min(tries, key=lambda tried: tried.badness)
 
 
 def _among(found: Recognition, odds: Mapping[str, float]) -> Recognition:

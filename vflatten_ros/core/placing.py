@@ -26,12 +26,14 @@ MOST = 120  # ends of a group, and points inside, that are judged
 CELL_M = 0.004  # of the images that judge a place
 COARSE, CUTS = (12.0, 9.0), (6.0, 5.0, 4.0, 3.0, 3.0, 3.0)  # of the fits of the outline, in sigmas
 MOST_FITS, KEPT, WAYS = 8, 4, 2  # of a category: tried, refined, kept
-PLACES = 6  # of a group, either way up, that are refined
+PLACES = 6  # of a group, either way up, that are looked at
+SEARCHED = 6  # of all of them, best first, round which better ones are searched
 STIFF = 0.05  # of the swing that is allowed: the groups are rigid
 NEAR_M = 0.02  # beyond the main group's outline
 END_SIGMA_M = 0.002
 STEPS = np.array([np.radians(8.0), 0.02, 0.02])  # of the search round a place: turn, shift
 FINEST = 16.0  # how much smaller they become
+WORTH_PLACING = 8.0  # cost of the largest group alone beyond the least of all groups
 WORTH_A_TURN = 4.0  # cost beyond the least, up to which a category is fitted and placed again
 
 
@@ -118,23 +120,26 @@ def place_groups(
         stiff = replace(template, swing=STIFF * template.swing)
         for pose, state, energy in _first_fits(stiff, shapes[0], alone):
             fits.append((energy, stiff, pose, state))
-    least = min(fit[0] for fit in fits)
-    likely = [fit for fit in fits if fit[0] < least + config.assembly.hopeless]
-    first = []
+    # each later one: cloth placed beside it makes no fit better, so most need not be placed
+    fits.sort(key=lambda fit: fit[0])
+    likely = [fit for fit in fits if fit[0] < fits[0][0] + config.assembly.hopeless]
+    first: list[Placing] = []
+    least = np.inf
     for done, (energy, template, pose, state) in enumerate(likely):
         progress("place", 0.4 + 0.4 * done / len(likely))
-        alone_so = Placing(template, pose, state, (), energy)
-        first.append(_fitted(_placed(alone_so, shapes, config), shapes, main, config))
-    least = min(placing.cost for placing in first)
+        placing = Placing(template, pose, state, (), energy)
+        if energy < least + WORTH_PLACING:
+            placing = _fitted(_placed(placing, shapes, config), shapes, main, config)
+            least = min(least, placing.cost)
+        first.append(placing)
     found: dict[str, Placing] = {}
-    for done, tried in enumerate(first):
-        progress("place", 0.8 + 0.2 * done / len(first))
-        if tried.cost < least + WORTH_A_TURN:
-            again = _fitted(_placed(tried, shapes, config), shapes, main, config)
-            tried = _placed(again, shapes, config)
-        category = tried.template.category
-        if category not in found or tried.cost < found[category].cost:
-            found[category] = tried
+    for placing in sorted(first, key=lambda placing: placing.cost):
+        found.setdefault(placing.template.category, placing)
+    for done, (category, placing) in enumerate(found.items()):
+        progress("place", 0.8 + 0.2 * done / len(found))
+        if placing.cost < least + WORTH_A_TURN:
+            again = _fitted(_placed(placing, shapes, config), shapes, main, config)
+            found[category] = _placed(again, shapes, config)
     return sorted(found.values(), key=lambda placing: placing.cost)
 
 
@@ -205,6 +210,8 @@ def _best(
     centre = turn * np.where(mirrored, np.conj(middle), middle) + shift
     where = np.column_stack([np.angle(turn), centre.real, centre.imag])
     cost = _costs(images, shape, mirrored, where, middle, config).sum(axis=0)
+    first = np.argsort(cost, kind="stable")[:SEARCHED]
+    mirrored, where, cost = mirrored[first], where[first], cost[first]
     scale = np.ones(len(where))
     ways = np.vstack([np.eye(3), -np.eye(3)]) * STEPS
     while scale.max() > 1 / FINEST:

@@ -154,15 +154,20 @@ def _arc(chord: Float, alike: Float) -> Float:
 def _supported(a: Int, b: Int, sheet: Bool, n: int, config: RotationConfig) -> Bool:
     """Keep links whose ends share neighbours: on a sheet the neighbourhoods overlap."""
     sheet = sheet.copy()
+    changed = np.ones(n, dtype=bool)
     for _ in range(3):
         rows = np.flatnonzero(sheet)
         i, j = a[rows], b[rows]
         ones = np.ones(2 * len(rows), dtype=np.float32)
         adjacent = csr_matrix((ones, (np.r_[i, j], np.r_[j, i])), shape=(n, n))
         degree = np.diff(adjacent.indptr)
+        again = changed[i] | changed[j]  # the others are as they were
+        rows, i, j = rows[again], i[again], j[again]
         common = np.asarray(adjacent[i].multiply(adjacent[j]).sum(1)).ravel()
         weak = (common < config.overlap * np.minimum(degree[i], degree[j])) | (common < 2)
         sheet[rows[weak]] = False
+        changed[:] = False
+        changed[i[weak]] = changed[j[weak]] = True
     return sheet
 
 
@@ -170,14 +175,14 @@ def _at_edge(a: Int, b: Int, xyz: Float, normal: Float) -> Bool:
     """Samples whose linked neighbours leave a wide sector empty."""
     n = len(xyz)
     centre, other = np.r_[a, b], np.r_[b, a]
-    order = np.argsort(centre, kind="stable")
-    centre, other = centre[order], other[order]
     least = np.abs(normal).argmin(1)
     e1 = np.cross(normal, np.eye(3)[least])
     e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
     e2 = np.cross(normal, e1)
     offset = xyz[other] - xyz[centre]
-    angle = np.arctan2((offset * e2[centre]).sum(1), (offset * e1[centre]).sum(1))
+    angle = np.arctan2(
+        np.einsum("ni,ni->n", offset, e2[centre]), np.einsum("ni,ni->n", offset, e1[centre])
+    )
     order = np.lexsort((angle, centre))
     angle = angle[order]
     count = np.bincount(centre, minlength=n)

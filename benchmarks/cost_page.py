@@ -24,8 +24,8 @@ Views are those of `bags/LS1_1`: every other one, all, and all two and four time
 their own."""
 RECORDED = """
 Views are those of recordings of one shirt by the simulation that made `bags/`, alike
-but for the number of views (`--rotations`); they are not carried with the code. 12 views show too
-little of it to be recognised, and more outlines are tried than from 24."""
+but for the number of views (`--rotations`); they are not carried with the code. How many
+ways to lay it flat are tried differs between them, and counts more than the number of views."""
 
 
 def exponent(sizes: Mapping[str, float]) -> float:

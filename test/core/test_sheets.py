@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.sheets import link_samples, sheet_edges
+from vflatten_ros.core.sheets import _supported, link_samples, sheet_edges
 
 CONFIG = RotationConfig()
 UP = np.array([0.0, 0.0, 1.0])
@@ -78,3 +78,26 @@ def test_the_edges_of_a_stack_are_in_doubt_beside_those_of_single_seams():
     assert (links.doubt[links.rim][of_stack] > 1.0).mean() > 0.9
     assert (links.doubt[links.rim][~of_stack] < 1.0).mean() > 0.9
     assert not links.doubt[~links.rim].any()
+
+
+def test_links_that_share_too_few_neighbours_go_round_by_round():
+    """As found by counting all shared neighbours anew in every round."""
+    rng = np.random.default_rng(3)
+    n = 150
+    a, b = np.triu_indices(n, 1)
+    near = np.abs(a - b) < 12  # a band, of which some links are missing
+    kept = near & (rng.random(len(a)) < 0.55)
+    a, b, start = a[near], b[near], kept[near]
+    expected, rounds = start.copy(), []
+    for _ in range(3):
+        around = [set() for _ in range(n)]
+        for i, j in zip(a[expected], b[expected], strict=True):
+            around[i].add(j)
+            around[j].add(i)
+        shared = np.array([len(around[i] & around[j]) for i, j in zip(a, b, strict=True)])
+        fewer = np.array([min(len(around[i]), len(around[j])) for i, j in zip(a, b, strict=True)])
+        weak = expected & ((shared < CONFIG.overlap * fewer) | (shared < 2))
+        rounds.append(int(weak.sum()))
+        expected &= ~weak
+    assert min(rounds) > 0  # each round has something to do
+    assert (_supported(a, b, start, n, CONFIG) == expected).all()

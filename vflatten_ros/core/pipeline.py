@@ -183,7 +183,7 @@ def _rotation(
     )
     none = np.zeros(0)
     notices = told + unfolded.notices
-    reason = best.untrusted or _odd(unfolded.outline, found)
+    reason = _odd(unfolded.outline, found) or best.untrusted
     if reason:
         notices = (*notices, Notice("untrusted", reason))
     flattened = Flattened(

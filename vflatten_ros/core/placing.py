@@ -33,7 +33,8 @@ NEAR_M = 0.02  # beyond the main group's outline
 END_SIGMA_M = 0.002
 STEPS = np.array([np.radians(8.0), 0.02, 0.02])  # of the search round a place: turn, shift
 FINEST = 16.0  # how much smaller they become
-WORTH_PLACING = 8.0  # cost of the largest group alone beyond the least of all groups
+WORTH_PLACING = 8.0  # cost of the largest group alone beyond the least of all groups, up to which
+# the others are placed beside it: e^-8 is less than any odds that are looked at
 WORTH_A_TURN = 4.0  # cost beyond the least, up to which a category is fitted and placed again
 
 
@@ -53,8 +54,8 @@ class Placing:
     template: Template
     pose: Float  # (3,)
     state: Float  # (m,)
-    motions: tuple[Motion, ...]  # of the groups; the first stays where it is
-    energy: float  # of the fit of the outline, in halves of squared sigmas
+    motions: tuple[Motion, ...]  # of the groups; the first stays where it is. None: not placed
+    energy: float  # of the fit of the outline, in halves of squared sigmas; if not placed, at least
     beside: float = 0.0  # cloth upon cloth of its own side, alike
 
     @property

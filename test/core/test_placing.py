@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from vflatten_ros.categories import load_templates
+from vflatten_ros.core import placing
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.placing import Group, place_groups
 from vflatten_ros.core.puzzle import Motion
@@ -103,7 +104,7 @@ def test_the_second_leg_is_put_where_it_was(mirrored):
     assert best.template.category == "trousers"
     assert placings[1].cost > best.cost + 3.0
     # what the first group alone rules out need not be placed; what may win is
-    placed = [len(placing.motions) == 2 for placing in placings]
+    placed = [len(p.motions) == 2 for p in placings]
     assert all(done for done, p in zip(placed, placings) if p.cost < best.cost + NO_ODDS)
     assert not all(placed)
     z = best.motions[1](second.points.uv @ np.array([1, 1j]))
@@ -119,3 +120,15 @@ def test_the_second_leg_is_put_where_it_was(mirrored):
     )
     for name in ("width", "length"):
         assert abs(found[name][0] / known[name][0] - 1) < 0.03
+
+
+@pytest.mark.parametrize("leg_first", [False, True])
+def test_what_is_not_placed_would_not_have_been_likely(monkeypatch, leg_first):
+    """A leg alone may be many things, so the likeliest of it are placed, not only the first."""
+    _, _, first, second = parted(Motion(False, np.exp(1.9j), 0.8 - 0.4j))
+    groups = [second, first] if leg_first else [first, second]
+    best = place_groups(groups, load_templates(), Config())[0]
+    monkeypatch.setattr(placing, "WORTH_PLACING", np.inf)
+    thorough = place_groups(groups, load_templates(), Config())[0]
+    assert best.template.category == thorough.template.category == "trousers"
+    assert best.cost == thorough.cost and best.motions == thorough.motions

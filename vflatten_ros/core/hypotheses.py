@@ -96,7 +96,7 @@ class Tried:
         left_out = max(0.0, 1.0 - self.unfolded.share - STRAYS) / MOSTLY_LEFT
         explained = self.found.fit.explained if self.found.fit is not None else 0.0
         odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD
-        if self.found.fit is not None and self.deep_m > MOST_DEEP_M:
+        if self.deep_m > MOST_DEEP_M:
             odd += ODD
         left_out += ASIDE * self.aside
         unknown = float(self.found.category == UNKNOWN)
@@ -165,8 +165,8 @@ def settled(tries: Sequence[Tried]) -> bool:
     if not tries:
         return False
     best = _best(tries)
-    near = [one for one in tries if one.badness < best.badness + RIVAL]
-    near = [one for one in near if one.found.category != UNKNOWN]
+    known = [one for one in tries if one.found.category != UNKNOWN]
+    near = [one for one in known if one.badness < best.badness + RIVAL]
     against = sum(one.found.category != best.found.category for one in near)
     agreed = len(near) - against >= MAJORITY * against
     placed = len(best.unfolded.parts) > 1  # groups that nothing joins but the category

@@ -110,6 +110,12 @@ def place_groups(
     templates : sequence of Template
     config : Config
     progress : Progress
+
+    Returns
+    -------
+    list of Placing
+        One for each category that the largest group may belong to. Those that it rules out against
+        the best one have no motions, and a cost that is at least WORTH_PLACING more.
     """
     shapes = [_shape(group) for group in groups]
     main = evidence_from(groups[0].outline, groups[0].points, config.recognition)

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from flat import lying_at
 
 from vflatten_ros.core import hypotheses
 from vflatten_ros.core.config import Config, RotationConfig
@@ -26,14 +27,21 @@ def tried(
     strain=0.0,
     parts=1,
     dent_m=0.0,
+    doubled=None,
 ):
-    """A towel of 0.4 x 0.4 m, or what is said of it; its upper edge may lie further in."""
+    """A towel of 0.4 x 0.4 m, or what is said of it; its upper edge may lie further in.
+
+    With a share that is `doubled` it is a single sheet.
+    """
     square = np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.4], [0.0, 0.4]])
     share_ = np.linspace(0.0, 1.0, 25, endpoint=False)[:, None]
     uv = np.vstack([a + share_ * (b - a) for a, b in zip(square, np.roll(square, -1, axis=0))])
     uv = np.minimum(uv, [0.4, 0.4 - dent_m])
     outline = SimpleNamespace(uv=uv, inferred=np.arange(100) < 100 * unseen)
-    points = SimpleNamespace(stress=np.where(np.arange(1000) < 1000 * strain, 0.002, 0.0005))
+    points = lying_at(np.random.default_rng(0).uniform(0.0, 0.4, (1000, 2)))
+    points.stress[:] = np.where(np.arange(1000) < 1000 * strain, 0.002, 0.0005)
+    on_others = np.argsort(points.uv[:, 0])[: round(1000 * (doubled or 0.0))]
+    points.xyz_hanger[on_others, 2] = 0.1 * np.arange(len(on_others))
     unfolded = SimpleNamespace(
         share=share, overlap=overlap, outline=outline, points=points, parts=(None,) * parts
     )
@@ -43,7 +51,7 @@ def tried(
         fit=SimpleNamespace(
             misfit=misfit,
             explained=explained,
-            template=SimpleNamespace(vertices=4),
+            template=SimpleNamespace(vertices=4, single_sheet=doubled is not None),
             points=lambda: square,
         ),
     )
@@ -65,6 +73,13 @@ def test_all_that_is_wrong_with_a_way_counts():
     assert all(way.badness > good + 0.4 for way in worse)
     as_any_result_has = tried(share=0.95, overlap=0.04, explained=0.96, strain=0.05)
     assert as_any_result_has.badness == good
+
+
+def test_a_single_sheet_lies_on_no_other_cloth_of_its_own():
+    garment = tried().badness
+    assert 0.0 < tried(doubled=0.01).doubled < 0.06
+    assert tried(doubled=0.01).badness == garment
+    assert tried(doubled=0.12).badness > garment + 0.4
 
 
 def test_a_large_piece_left_aside_is_worse_than_as_many_shreds():

@@ -14,6 +14,7 @@ import numpy as np
 
 from vflatten_ros.core.category_outline import MOST_DEEP_M, deep_inside_m
 from vflatten_ros.core.config import Config, RotationConfig
+from vflatten_ros.core.doubled import MISLAID, doubled_share
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold_group
 from vflatten_ros.core.placing import Group, place_groups
@@ -53,6 +54,7 @@ DOUBTFUL = 0.3  # badness above which a result is not to be trusted, and more wa
 UNSURE = 0.7  # probability of its category below which it is not, either
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
+MOSTLY_DOUBLED = 0.1  # share of a single sheet on other cloth of its own that counts as 1
 STRAINED_M = 0.001  # misfit of the distances at a point that cloth laid flat seldom has
 STRAIN, MOSTLY_STRAINED = 0.06, 0.1  # share of points with more; more that counts as 1
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
@@ -81,6 +83,13 @@ class Tried:
             return 0.0
         return deep_inside_m(self.unfolded.outline, self.found.fit)
 
+    @cached_property
+    def doubled(self) -> float:
+        """Share of a single sheet that lies on other cloth of its own; 0 for any other item."""
+        if self.found.fit is None or not self.found.fit.template.single_sheet:
+            return 0.0
+        return doubled_share(self.unfolded.points)
+
     @property
     def badness(self) -> float:
         """How badly and unsurely a category fits, how far from flat it lies, what is left out.
@@ -93,6 +102,7 @@ class Tried:
         folded = max(0.0, self.unfolded.overlap - LAID) / MOSTLY_LAID
         strain = float((self.unfolded.points.stress > STRAINED_M).mean())
         folded += max(0.0, strain - STRAIN) / MOSTLY_STRAINED
+        folded += max(0.0, self.doubled - MISLAID) / MOSTLY_DOUBLED
         left_out = max(0.0, 1.0 - self.unfolded.share - STRAYS) / MOSTLY_LEFT
         explained = self.found.fit.explained if self.found.fit is not None else 0.0
         odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vflatten_ros.core.config import RecognitionConfig
+from vflatten_ros.core.doubled import MISLAID, doubled_share
 from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.evidence import Evidence, evidence_from, look_up
 from vflatten_ros.core.model_images import model_image_scores
@@ -30,6 +31,7 @@ BEST = 5  # hypotheses of a category that are refined to the end
 FREEDOM = 25.0  # of an ordinary category: what its pose and sizes cost in evidence
 AS_CUT = 0.2  # of the swing of parts, where nothing turned them
 UNEXPLAINED = 1.5  # what an observation that only others explain costs a category (log odds)
+DOUBLED = 60.0  # what more costs a category that is one (log odds)
 WORTH_WEIGHING = 1e-4  # probability of a category before loose parts were turned
 HOPELESS = 40.0  # a category with this much more energy than the best is not refined with care
 COARSE = (((12.0, 9.0), 16), ((6.0, 6.0), BEST))  # cuts of the steps, in sigmas; hypotheses kept
@@ -65,7 +67,8 @@ def recognise(
     outline : Outline
         Closed outline of the flattened item; inferred parts are not trusted.
     points : FlatPoints
-        Flattened points, of which the seen ones must lie on the item.
+        Flattened points, of which the seen ones must lie on the item. Where they lie on others that
+        hang elsewhere, the item is no single sheet.
     templates : tuple of Template
         Categories to choose from.
     config : RecognitionConfig
@@ -88,7 +91,7 @@ def recognise(
     evidence = evidence_from(outline, points, config)
     scores = model_image_scores(evidence.outline, templates, config.decay, config.model_rotations)
     fits = fit_templates(templates, evidence, config, progress, begin)
-    probabilities = _probabilities(fits, evidence, config)
+    probabilities = _probabilities(fits, evidence, points, config)
     category = max(probabilities, key=lambda name: probabilities[name])
     known = {name: p for name, p in probabilities.items() if name != UNKNOWN}
     fit = fits[max(known, key=lambda name: known[name])]
@@ -131,7 +134,7 @@ def recognise_again(
     alike = [t for t in templates if t.same_build(before.template)]
     alike = [t for t in alike if found.probabilities.get(t.category, 0.0) > WORTH_WEIGHING]
     fits = {t.category: _fitted_from(before, t, evidence) for t in alike or [before.template]}
-    weighed = _probabilities(fits, evidence, config)
+    weighed = _probabilities(fits, evidence, points, config)
     del weighed[UNKNOWN]
     together = sum(found.probabilities.get(name, 0.0) for name in fits) / sum(weighed.values())
     category = max(weighed, key=lambda name: weighed[name])
@@ -285,15 +288,19 @@ def _edge_distances(evidence: Evidence, outline: Float) -> tuple[Float, Float]:
 
 
 def _probabilities(
-    fits: Mapping[str, Fit], evidence: Evidence, config: RecognitionConfig
+    fits: Mapping[str, Fit], evidence: Evidence, points: FlatPoints, config: RecognitionConfig
 ) -> dict[str, float]:
     names = [*fits, UNKNOWN]
+    doubled = DOUBLED * max(0.0, doubled_share(points) - MISLAID)
     observations = 2.0 * evidence.total
     # fits are lenient with what they leave unexplained; where another category explains it, it is
     # no error of the flattening
     most = max(fit.explained for fit in fits.values())
     logs = [
-        fit.evidence - UNEXPLAINED * observations * (most - fit.explained) for fit in fits.values()
+        fit.evidence
+        - UNEXPLAINED * observations * (most - fit.explained)
+        - doubled * fit.template.single_sheet
+        for fit in fits.values()
     ]
     logs.append(-FREEDOM - config.unknown_misfit * observations)
     value = np.exp(np.array(logs) - max(logs))

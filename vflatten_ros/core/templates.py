@@ -22,7 +22,16 @@ Int = NDArray[np.int64]
 
 _TERM = re.compile(r"([+-]?)(?:(\d+\.?\d*|\.\d+)\*?)?([A-Za-z_]\w*)?")
 MOST_BEND = np.radians(110.0)  # of an outline at a joint
-_KEYS = {"category", "sizes", "parts", "half", "landmarks", "measurements", "order"}
+_KEYS = {
+    "category",
+    "single_sheet",
+    "sizes",
+    "parts",
+    "half",
+    "landmarks",
+    "measurements",
+    "order",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +59,7 @@ class Template:
     side: Float  # (p,) 1 right or middle, -1 left: mirrored
     paths: Mapping[str, tuple[Int, ...]]  # measurement -> its path, and its mirror image
     order: tuple[str, ...]  # measurements that ascend by definition
+    single_sheet: bool = False  # both faces are of one sheet, as a towel's
 
     @property
     def dimensions(self) -> int:
@@ -271,9 +281,16 @@ class _Reader:
             side=np.array(side),
             paths=paths,
             order=order,
+            single_sheet=self.single_sheet(),
         )
         _check_outline(template.outline(np.zeros(template.dimensions)))
         return template
+
+    def single_sheet(self) -> bool:
+        single = self.data.get("single_sheet", False)
+        if not isinstance(single, bool):
+            raise InvalidConfig(f"single_sheet: expected true or false, got {single!r}")
+        return single
 
     def spreads(self) -> tuple[Float, Float]:
         """Typical sizes and how they vary together: a ratio follows the size that it is of."""

@@ -65,6 +65,15 @@ def test_a_slit_with_strays_beside_it_is_one():
     assert np.ptp(found[off < STEP_M, 1]) > 0.09
 
 
+def test_a_slit_of_which_little_is_closed_is_one():
+    uv, *rest = cloth(0.15)
+    uv[(uv[:, 0] > AT_M) & (uv[:, 1] < 0.078), 0] += 2 * STEP_M
+    (found,) = slits(*layers((uv, *rest)), CONFIG)
+    assert found[:, 1].min() < 0.01 and found[:, 1].max() == pytest.approx(0.15, abs=0.02)
+    uv[(uv[:, 0] > AT_M) & (uv[:, 1] < 0.078), 0] += 2 * STEP_M  # too wide: a notch
+    assert not slits(*layers((uv, *rest)), CONFIG)
+
+
 @pytest.mark.parametrize(
     "whole", [{"slit_m": 0.0}, {"slit_m": 0.05}, {"slit_m": 0, "hole_m": 0.008}]
 )

@@ -21,6 +21,7 @@ BESIDE = 2.0  # between the two sides of a slit, most of which is closed, in spa
 WIDE = 4.0  # the same where it opens
 WAY_M = 0.053  # over links from one side to the other, round a hole in what was seen
 LONG_M = 0.06  # shortest slit
+SEED_M, SEED_THIN = 0.05, 0.3  # least of it that is closed and in one, and how straight that is
 AWAY = 3.0  # from the middle of a slit, where another layer may go on across it, in spacings
 THIN = 0.625  # deviation across a slit, in spacings: straight, as what noise tears is not
 CROSSED = 0.5  # share of a slit that another layer crosses, for the item to have none there
@@ -53,18 +54,22 @@ def slits(uv: Float, side: Float, edge: Int, links: Links, config: RotationConfi
     i, j = _torn(laid, ends, BESIDE * laid.spacing_m)
     middle = (uv[i] + uv[j]) / 2
     label = _stretches(middle, laid)
-    long = np.bincount(label) * laid.spacing_m > LONG_M  # fewer points than that cannot be
+    long = np.bincount(label) * laid.spacing_m > SEED_M  # fewer points than that cannot be
     found = []
     for k in np.flatnonzero(long):
         own = label == k
         line = middle[own]
-        if np.ptp(line, axis=0).max() < LONG_M:
+        if np.ptp(line, axis=0).max() < SEED_M:
             continue
         centre, across, thickness = _straight(line)
-        if thickness > THIN * laid.spacing_m:
+        thin = THIN if np.ptp(line, axis=0).max() >= LONG_M else SEED_THIN
+        if thickness > thin * laid.spacing_m:
             continue
-        if _crossed(laid, i[own], j[own]).mean() < CROSSED:
-            found.append(_widened(laid, line, centre, across, ends))
+        if _crossed(laid, i[own], j[own]).mean() >= CROSSED:
+            continue
+        wide = _widened(laid, line, centre, across, ends)
+        if np.ptp(wide, axis=0).max() >= LONG_M:
+            found.append(wide)
     return found
 
 

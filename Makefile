@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -eo pipefail -c
 .DEFAULT_GOAL := help
 
-BAG ?= bags/LS1_1
+BAG ?= bags/SH1_1
 PROTOCOL ?=
 PYTHON ?= python3
 

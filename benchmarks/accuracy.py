@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """How far results are from the truth of simulated recordings: writes docs/accuracy.md.
 
-    accuracy.py [FOLDER ...] [--runs rotation,protocol,...] [--output FILE]
+    accuracy.py [FOLDER ...] [--runs rotation,protocol,...] [--output FILE] [--about TEXT]
 
 Each FOLDER is a recording with truth.json and truth.npz, or holds such recordings (default: bags/).
 Every recording is flattened with all views and no manual input (rotation), by the paper's protocol
@@ -103,6 +103,7 @@ def main() -> int:
     parser.add_argument("folders", type=Path, nargs="*", default=[ROOT / "bags"])
     parser.add_argument("--runs", default=",".join(RUNS), help="some of " + ",".join(RUNS))
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "accuracy.md")
+    parser.add_argument("--about", default="", help="a paragraph about these recordings")
     args = parser.parse_args()
     runs = args.runs.split(",")
     if not set(runs) <= set(RUNS):
@@ -111,7 +112,7 @@ def main() -> int:
     if not folders:
         print("accuracy: no recording with truth.json in the folders given", file=sys.stderr)
         return 1
-    parts = [HEAD]
+    parts = [HEAD, *([args.about, ""] if args.about else [])]
     for run in runs:
         pictures = args.output.with_suffix("") / run
         rows = [row for folder in folders if (row := compare(folder, run, pictures))]

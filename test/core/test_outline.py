@@ -56,6 +56,33 @@ def test_a_bite_is_inferred_where_the_cloth_goes_on():
     assert not inferred(uv, edge)[1].any()
 
 
+def test_what_lies_between_groups_is_hidden_cloth_of_the_item_that_placed_them():
+    """Two strips, at the bottom and at the top of an item that is a little larger."""
+
+    def keep(p):
+        return np.abs(p[:, 1] - SIDE_M / 2) > 0.04
+
+    uv, edge = square(keep)
+    low, high = -0.004, SIDE_M + 0.004
+    item = np.array([[low, low], [high, low], [high, high], [low, high]])
+    sigma = np.full(len(uv), 0.002)
+    ends = edge
+    facing = np.abs(uv[:, 1] - SIDE_M / 2) < 0.04 + 1.5 * STEP_M
+    edge = np.where(facing & (edge > 0), 2, edge)
+    outline = outline_of(uv, sigma, edge, CONFIG, (), item)
+    assert twice_area(outline.uv) / 2 == pytest.approx(SIDE_M**2, rel=0.05)
+    between = np.abs(outline.uv[:, 1] - SIDE_M / 2) < 0.02
+    seen = np.abs(outline.uv[:, 1] - SIDE_M / 2) > 0.06
+    assert between.sum() > 8 and outline.inferred[between].all()
+    assert not outline.inferred[seen].any()
+    # without it only one strip would be left; and where cloth ends, none is hidden beyond
+    for strip in (
+        outline_of(uv, sigma, edge, CONFIG),
+        outline_of(uv, sigma, ends, CONFIG, (), item),
+    ):
+        assert twice_area(strip.uv) / 2 < SIDE_M**2 / 2
+
+
 @pytest.mark.parametrize(("other", "goes_on"), [(1, False), (2, True)])
 def test_one_side_of_a_slit_tells_what_the_other_is(other, goes_on):
     """Between two legs one hangs before the edge of the other."""

@@ -1,6 +1,8 @@
-"""Trousers of which the second leg came off are put together as the category has them."""
+"""Items of which a part came off are put together as the category has them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -27,7 +29,10 @@ def trousers():
 
 
 def group(polygon, hidden, motion):
-    """Both sides of a part of the item; its outline is inferred where `hidden` says so."""
+    """Both sides of a part of the item; its outline is inferred where `hidden` says so.
+
+    Before the motion front and back lay upon each other, and so they hang.
+    """
     low, high = polygon.min(axis=0), polygon.max(axis=0)
     u, v = np.meshgrid(np.arange(low[0], high[0], STEP_M), np.arange(low[1], high[1], STEP_M))
     uv = np.column_stack([u.ravel(), v.ravel()])
@@ -47,7 +52,7 @@ def group(polygon, hidden, motion):
     n = len(uv)
     points = FlatPoints(
         uv=moved(uv),
-        xyz_hanger=np.zeros((n, 3)),
+        xyz_hanger=np.column_stack([uv, np.zeros(n)]),
         view_id=np.zeros(n, dtype=np.int64),
         pixel=np.zeros((n, 2), dtype=np.int64),
         sigma_m=np.full(n, 0.004),
@@ -120,6 +125,44 @@ def test_the_second_leg_is_put_where_it_was(mirrored):
     )
     for name in ("width", "length"):
         assert abs(found[name][0] / known[name][0] - 1) < 0.03
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("right", [False, True])
+def test_a_corner_of_a_hem_is_put_where_it_hangs_from(right, mirrored):
+    """The left one is like the right one turned over, but for where it hangs."""
+    template = next(t for t in load_templates() if t.category == "t_shirt")
+    outline = template.outline(np.zeros(template.dimensions))
+    names = list(template.points[: template.vertices])
+    armpits = [outline[names.index(f"{of}_armpit")] for of in ("left", "right")]
+    left = armpits[0]
+    side = np.abs(left[0])
+    above, below = left[1] - 0.05, left[1] - 0.15
+    shirt = [p for p in outline if p[1] > 0.01]
+    at = next(k for k, p in enumerate(shirt) if (p == left).all())
+    shirt[at + 1 : at + 1] = [np.array([u, above]) for u, _ in armpits]
+    first = group(
+        np.array(shirt),
+        lambda edge: np.abs(edge[:, 1] - above) < 1e-6,
+        Motion(False, 1.0, 0.0),
+    )
+    corner = np.array([[left[0], 0.0], [-0.02, 0.0], [-0.10, below], [left[0], below]])
+    motion = Motion(mirrored, np.exp(1.9j), 0.8 - 0.4j)
+    second = group(
+        corner,
+        lambda edge: (np.abs(edge[:, 0]) < side - 1e-6) & (edge[:, 1] > 1e-6),
+        motion,
+    )
+    if right:
+        hangs = second.points.xyz_hanger * [-1.0, 1.0, 1.0]
+        second = replace(second, points=replace(second.points, xyz_hanger=hangs))
+    best = place_groups([first, second], load_templates(), Config())[0]
+    assert best.template.category == "t_shirt"
+    z = best.motions[1](second.points.uv @ np.array([1, 1j]))
+    hangs = second.points.xyz_hanger @ np.array([1, 1j, 0])
+    assert np.abs(z - hangs).max() < 0.06 and np.median(np.abs(z - hangs)) < 0.02
+    # and its front is not taken for its back
+    assert best.motions[1].mirrored == (mirrored != right)
 
 
 @pytest.mark.parametrize("leg_first", [False, True])

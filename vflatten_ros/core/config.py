@@ -411,6 +411,19 @@ class AssemblyConfig(Checked):
     overlap_weight: float = option(
         60.0, "The same for its cloth, which must not lie on other cloth.", low=0.0, high=10000.0
     )
+    chord_weight: float = option(
+        60.0,
+        "The same for points of one side, which must not hang farther apart than they lie.",
+        low=0.0,
+        high=10000.0,
+    )
+    slack_weight: float = option(
+        10.0,
+        "The same for how much farther apart they lie than they hang: any chord up to the way "
+        "along the cloth is as likely.",
+        low=0.0,
+        high=1000.0,
+    )
     sigma_m: float = option(
         0.006, "Error of the outline where pieces were placed, one sigma, m.", low=0.0, high=0.1
     )

@@ -153,6 +153,7 @@ def _with_gaps(
     """The outline, counter-clockwise, going in and out of gaps that reach it."""
     flip = slice(None, None, 1 if twice_area(outline.uv) > 0 else -1)
     given = Outline(outline.uv[flip], outline.sigma_m[flip], outline.inferred[flip])
+    gaps = _without_hidden(gaps, given, origin)
     if not gaps.any():
         return given
     rest = cv2.morphologyEx(body & ~gaps & 1, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
@@ -166,6 +167,20 @@ def _with_gaps(
     far, near = cKDTree(given.uv).query(uv)
     uv = np.where((far < 0.01)[:, None], given.uv[near], uv)
     return Outline(uv, given.sigma_m[near], given.inferred[near] & (far < 0.02))
+
+
+def _without_hidden(gaps: NDArray[np.uint8], outline: Outline, origin: Float) -> NDArray[np.uint8]:
+    """Without the gaps that open where the outline is inferred: there is hidden cloth."""
+    if not gaps.any() or not outline.inferred.any():
+        return gaps
+    count, label = cv2.connectedComponents(cv2.dilate(gaps, np.ones((3, 3), np.uint8)))
+    fine = _evenly(outline, 8 * SAMPLES)
+    col, row = np.rint((fine.uv - origin) / CELL_M).astype(int).T
+    mouth = label[row.clip(0, label.shape[0] - 1), col.clip(0, label.shape[1] - 1)]
+    met = np.bincount(mouth, minlength=count)
+    hidden = np.bincount(mouth, fine.inferred, minlength=count) > 0.5 * met
+    hidden[0] = False
+    return np.where(hidden[label], 0, gaps).astype(np.uint8)
 
 
 def _across_gaps(uv: Float, normal: Float, origin: Float, distance: Float) -> Bool:

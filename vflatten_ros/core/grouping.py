@@ -145,7 +145,11 @@ def unfold_group(
 
 
 def put_beside(
-    groups: Sequence[Unfolded], motions: Sequence[Motion], sigma_m: float, config: RotationConfig
+    groups: Sequence[Unfolded],
+    motions: Sequence[Motion],
+    item: Float,
+    sigma_m: float,
+    config: RotationConfig,
 ) -> Unfolded:
     """Several groups in one plane.
 
@@ -154,6 +158,8 @@ def put_beside(
     groups : sequence of Unfolded
     motions : sequence of Motion
         Of their planes.
+    item : ndarray of shape (c, 2)
+        Outline of the item by which they were placed.
     sigma_m : float
         How far the places of all but the first may be off.
     """
@@ -164,7 +170,7 @@ def put_beside(
         sigma = np.hypot(group.points.sigma_m, sigma_m if k else 0.0)
         points.append(replace(group.points, uv=_moved(group.points.uv, motion), sigma_m=sigma))
         sides.append(-group.side if motion.mirrored else group.side)
-    return together(groups, tuple(parts), points, sides, config)
+    return together(groups, tuple(parts), points, sides, config, item)
 
 
 def _moved(uv: Float, motion: Motion) -> Float:

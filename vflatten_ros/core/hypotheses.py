@@ -269,7 +269,7 @@ class _Draw:
             if odds[placing.template.category] < LEAST_ODDS:
                 break
             sigma_m = config.assembly.sigma_m
-            beside = put_beside(laid, placing.motions, sigma_m, config.rotation)
+            beside = put_beside(laid, placing.motions, placing.outline, sigma_m, config.rotation)
             (only,) = (t for t in self._templates if t.category == placing.template.category)
             # all groups' ends say which way up it lies; where groups meet, the outline may not
             begin = {only.category: (placing.pose, only.state_of(placing.template, placing.state))}

@@ -14,17 +14,23 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from vflatten_ros.core.templates import Template
-from vflatten_ros.core.values import Float
+from vflatten_ros.core.values import Float, Int
 
 CELL_M = 0.02
 CUT_M = 0.08  # farther off is no worse
 DEEP_M = 0.02  # cloth is this deep inside the piece before an outline there counts
 SIZES = (0.9, 1.1, 1.4)  # of the whole item's longest extent over the piece's
 ROTATIONS = 24
+AROUND = 2  # cells between two shifts that differ, at least
 
 
 def matches(
-    template: Template, ends: Float, inner: Float, count: int, cut: Float | None = None
+    template: Template,
+    ends: Float,
+    inner: Float,
+    count: int,
+    cut: Float | None = None,
+    each: int = 1,
 ) -> tuple[Float, Float]:
     """Best poses of typical cuts of a category, or of one cut, for a piece of an item.
 
@@ -39,6 +45,8 @@ def matches(
         Poses wanted.
     cut : ndarray of shape (m,), optional
         State of the template; typical ones of several sizes by default.
+    each : int, optional
+        Most shifts of one rotation.
 
     Returns
     -------
@@ -67,17 +75,28 @@ def matches(
         centre = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
         turned = [(outline - centre) @ _rotation(angle).T + middle for angle in angles]
         images = _misfit_of_shifts(turned, shape, parts)
-        least = images.reshape(ROTATIONS, -1).argmin(axis=1)
-        for angle, image, at in zip(angles, images, least, strict=True):
-            row, col = np.unravel_index(int(at), shape)
-            size_cells = np.array(shape)[::-1]
-            shift = (np.array([col, row]) + size_cells // 2) % size_cells - size_cells // 2
-            place = shift * CELL_M + middle + low
-            poses.append(np.r_[angle, place - _rotation(angle) @ centre])
-            states.append(state)
+        size_cells = np.array(shape)[::-1]
+        for angle, image in zip(angles, images, strict=True):
+            row, col = _minima(image, each)
+            shift = (np.stack([col, row], axis=1) + size_cells // 2) % size_cells - size_cells // 2
+            place = shift * CELL_M + middle + low - _rotation(angle) @ centre
+            poses.append(np.column_stack([np.full(len(place), angle), place]))
+            states += [state] * len(place)
             costs.append(image[row, col])
-    best = np.argsort(costs, kind="stable")[:count]
-    return np.array(poses)[best], np.array(states)[best]
+    best = np.argsort(np.concatenate(costs), kind="stable")[:count]
+    return np.concatenate(poses)[best], np.array(states)[best]
+
+
+def _minima(image: NDArray[np.float32], count: int) -> tuple[Int, Int]:
+    """Rows and columns of the least values that are the least around, the image going round."""
+    if count == 1:
+        row, col = np.unravel_index([int(image.argmin())], image.shape)
+        return row, col
+    wrapped = np.pad(image, AROUND, mode="wrap")
+    least = cv2.erode(wrapped, np.ones((2 * AROUND + 1, 2 * AROUND + 1), np.uint8))
+    row, col = np.nonzero(image == least[AROUND:-AROUND, AROUND:-AROUND])
+    best = np.argsort(image[row, col], kind="stable")[:count]
+    return row[best], col[best]
 
 
 def _misfit_of_shifts(

@@ -186,6 +186,7 @@ def _rotation(
     reason = _odd(unfolded.outline, found) or best.untrusted
     if reason:
         notices = (*notices, Notice("untrusted", reason))
+    placed_m = config.assembly.sigma_m if len(unfolded.parts) > 1 else 0.0
     flattened = Flattened(
         points=unfolded.points,
         start_uv=None,
@@ -194,6 +195,7 @@ def _rotation(
         correspondences=given.used,
         notices=notices,
         seen=coverage(unfolded.surface, views),
+        outline_sigma_m=float(np.hypot(config.rotation.outline_sigma_m, placed_m)),
     )
     return flattened, found
 
@@ -227,7 +229,7 @@ def _described(
     measured = measure(recognition, outline, points, config.measurement)
     automatic = config.method == "rotation"
     used = sorted({int(i) for i in points.view_id if i >= 0})
-    shared = np.sqrt(2.0) * config.rotation.outline_sigma_m if automatic else 0.0  # of two ends
+    shared = np.sqrt(2.0) * flattened.outline_sigma_m  # of two ends
     measurements = tuple(
         replace(m, sigma_m=float(np.hypot(m.sigma_m, shared))) for m in measured.measurements
     )

@@ -1,19 +1,22 @@
 """Groups of pieces that nothing seen joins, placed as a category's outline has them.
 
 Every group lies flat by itself, front and back. Its ends lie on the outline of the whole item, its
-cloth inside, and not on cloth of the same side. The category's outline is fitted to the largest
-group, the others are tried all over it, either way up, and the outline is fitted to all.
+cloth inside, and not on cloth of the same side. And no two points hang farther apart than it is
+along the cloth (`cloth_ways`). The category's outline is fitted to the
+largest group, the others are tried all over it, either way up, and the outline is fitted to all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vflatten_ros.core.cloth_ways import ClothWays, cloth_ways
 from vflatten_ros.core.config import AssemblyConfig, Config
 from vflatten_ros.core.evidence import Evidence, evidence_from, robust_mean, seen_beside
 from vflatten_ros.core.partial_match import matches
@@ -26,10 +29,15 @@ MOST = 120  # ends of a group, and points inside, that are judged
 CELL_M = 0.004  # of the images that judge a place
 COARSE, CUTS = (12.0, 9.0), (6.0, 5.0, 4.0, 3.0, 3.0, 3.0)  # of the fits of the outline, in sigmas
 MOST_FITS, KEPT, WAYS = 8, 4, 2  # of a category: tried, refined, kept
-PLACES = 6  # of a group, either way up, that are looked at
-SEARCHED = 6  # of all of them, best first, round which better ones are searched
+PLACES, EACH = 60, 6  # of a group, either way up, that are looked at; of one rotation
+SEARCHED = 8  # of all of them, best first, round which better ones are searched
+TOGETHER = 4  # places of the groups before, with which the next is placed
+ALIKE_M = 0.01  # between the middles of a group in two places that are one
 STIFF = 0.05  # of the swing that is allowed: the groups are rigid
 NEAR_M = 0.02  # beyond the main group's outline
+THIN = 4  # of these points every fourth is judged by its chords
+NEAREST_M = 0.03  # from which on it counts how much farther apart points lie than they hang
+TORN_M = 0.02  # excess of a chord over the way along the flat cloth that errors make
 END_SIGMA_M = 0.002
 STEPS = np.array([np.radians(8.0), 0.02, 0.02])  # of the search round a place: turn, shift
 FINEST = 16.0  # how much smaller they become
@@ -56,7 +64,13 @@ class Placing:
     state: Float  # (m,)
     motions: tuple[Motion, ...]  # of the groups; the first stays where it is. None: not placed
     energy: float  # of the fit of the outline, in halves of squared sigmas; if not placed, at least
-    beside: float = 0.0  # cloth upon cloth of its own side, alike
+    beside: float = 0.0  # of cloth upon cloth of its own side, and of chords, alike
+
+    @property
+    def outline(self) -> Float:
+        """(c, 2) of the item."""
+        outline: Float = place(self.template, self.pose, self.state)[0][: self.template.vertices]
+        return outline
 
     @property
     def cost(self) -> float:
@@ -73,7 +87,13 @@ class _Shape:
     spacing_m: float  # of the ends
     inner: Complex  # (i,)
     up: Float  # (i,)
+    hangs: Float  # (i, 3) where they hang, m
     cloth: tuple[Complex, Complex]  # all points with the outside up, and down
+
+    @property
+    def middle(self) -> complex:
+        """Of what is inside."""
+        return complex(self.inner.mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +103,35 @@ class _Images:
     low: Float  # (2,)
     signed: Float  # distance to the category's outline, inside negative, m
     taken: tuple[Float, Float]  # depth in what lies there outside up, and down, m
+    ways: ClothWays
+    ways_m: Float  # (2, c + 1, l) to some of what lies there, from every cell, of either side
+    laid: Complex  # (l,) where that lies
+    same: NDArray[np.bool_]  # (i, l) whether some of the group is of its side, if not mirrored
+    clear: NDArray[np.bool_]  # (i, l) whether that is known
+    chord_m: Float  # (i, l) between them as they hang
 
-    def cells(self, uv: Float) -> Int:
-        """(...) numbers of the cells at (..., 2) places, or nearest to them."""
+    def cells(self, z: Complex) -> Int:
+        """Numbers of the cells at places, or nearest to them."""
         rows, cols = self.signed.shape
-        at = np.rint((uv - self.low) / CELL_M).astype(np.int64)
-        cell: Int = at[..., 1].clip(0, rows - 1) * cols + at[..., 0].clip(0, cols - 1)
+        col = np.rint((z.real - self.low[0]) / CELL_M).astype(np.int64).clip(0, cols - 1)
+        row = np.rint((z.imag - self.low[1]) / CELL_M).astype(np.int64).clip(0, rows - 1)
+        cell: Int = row * cols + col
         return cell
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Places of a group."""
+
+    mirrored: NDArray[np.bool_]  # (t,)
+    where: Float  # (t, 3) turn, and where the middle of what is judged lies
+
+    def motion(self, which: int, shape: _Shape) -> Motion:
+        """To one of them."""
+        mirrored, (angle, u, v) = bool(self.mirrored[which]), self.where[which]
+        turn = complex(np.exp(1j * angle))
+        arm = np.conj(shape.middle) if mirrored else shape.middle
+        return Motion(mirrored, turn, complex(u + 1j * v - turn * arm))
 
 
 STAYS = Motion(False, 1.0, 0.0)
@@ -172,18 +214,43 @@ def _first_fits(
 
 def _placed(placing: Placing, shapes: Sequence[_Shape], config: Config) -> Placing:
     """Place the groups under the outline, near where they are if they are somewhere."""
-    outline = place(placing.template, placing.pose, placing.state)[0][: placing.template.vertices]
+    template, assembly = placing.template, config.assembly
+    outline = placing.outline
+    ways = cloth_ways(outline, template.seam, template.single_sheet)
+    main_m = ways.to(shapes[0].inner[::THIN])
+    images = partial(_images, outline=outline, ways=ways, main_m=main_m)
+    starts = placing.motions or _together(placing, shapes, images, assembly)
     motions, beside = [STAYS], 0.0
     for k, shape in enumerate(shapes[1:], start=1):
-        images = _images(shapes[:k], motions, outline, shape)
-        if placing.motions:
-            starts: Sequence[Motion] = [placing.motions[k]]
-        else:
-            starts = _candidates(placing.template, placing.pose, placing.state, shape)
-        motion, overlap = _best(images, shape, starts, config.assembly)
-        motions.append(motion)
-        beside += overlap
+        here = images(shapes[:k], motions, shape)
+        placed = _searched(here, shape, _places([starts[k]], shape), assembly)
+        motions.append(placed.motion(0, shape))
+        beside += float(_costs(here, shape, placed, assembly)[1:].sum())
     return replace(placing, motions=tuple(motions), beside=beside)
+
+
+def _together(
+    placing: Placing,
+    shapes: Sequence[_Shape],
+    images: Callable[[Sequence[_Shape], Sequence[Motion], _Shape], _Images],
+    config: AssemblyConfig,
+) -> tuple[Motion, ...]:
+    """Places of all groups, of those that each by itself might have.
+
+    Which of a group's is right may show only in that the next group fits beside it.
+    """
+    kept: list[tuple[tuple[Motion, ...], float]] = [((STAYS,), 0.0)]
+    for k, shape in enumerate(shapes[1:], start=1):
+        starts = _candidates(placing.template, placing.pose, placing.state, shape)
+        alone = images(shapes[:1], [STAYS], shape)
+        places = _searched(alone, shape, _places(starts, shape), config)
+        tried = []
+        for motions, cost in kept:
+            here = alone if k == 1 else images(shapes[:k], motions, shape)
+            costs = cost + _costs(here, shape, places, config).sum(axis=0)
+            tried += [((*motions, places.motion(j, shape)), c) for j, c in enumerate(costs)]
+        kept = sorted(tried, key=lambda one: one[1])[:TOGETHER]
+    return kept[0][0]
 
 
 def _fitted(placing: Placing, shapes: Sequence[_Shape], main: Evidence, config: Config) -> Placing:
@@ -200,81 +267,96 @@ def _candidates(template: Template, pose: Float, state: Float, shape: _Shape) ->
     turn, shift = np.exp(1j * pose[0]), pose[1] + 1j * pose[2]
     for mirrored in (False, True):
         ends, inner = (z.conj() if mirrored else z for z in (shape.ends, shape.inner))
-        poses, _ = matches(template, _real(ends), _real(inner), PLACES, state)
+        poses, _ = matches(template, _real(ends), _real(inner), PLACES, state, EACH)
         for angle, u, v in poses:  # of the outline as the group has it
             back = turn * np.exp(-1j * angle)
             found.append(Motion(mirrored, complex(back), complex(shift - back * (u + 1j * v))))
     return found
 
 
-def _best(
-    images: _Images, shape: _Shape, starts: Sequence[Motion], config: AssemblyConfig
-) -> tuple[Motion, float]:
-    """Best place near any of the starts, and its cost beside the outline's: cloth upon cloth."""
-    mirrored = np.array([m.mirrored for m in starts])
-    turn, shift = np.array([m.turn for m in starts]), np.array([m.shift for m in starts])
-    middle = shape.inner.mean()
-    centre = turn * np.where(mirrored, np.conj(middle), middle) + shift
-    where = np.column_stack([np.angle(turn), centre.real, centre.imag])
-    cost = _costs(images, shape, mirrored, where, middle, config).sum(axis=0)
+def _places(motions: Sequence[Motion], shape: _Shape) -> _Places:
+    mirrored = np.array([m.mirrored for m in motions])
+    turn, shift = np.array([m.turn for m in motions]), np.array([m.shift for m in motions])
+    centre = turn * np.where(mirrored, np.conj(shape.middle), shape.middle) + shift
+    return _Places(mirrored, np.column_stack([np.angle(turn), centre.real, centre.imag]))
+
+
+def _searched(images: _Images, shape: _Shape, starts: _Places, config: AssemblyConfig) -> _Places:
+    """The best places near the starts, best first."""
+    cost = _costs(images, shape, starts, config).sum(axis=0)
     first = np.argsort(cost, kind="stable")[:SEARCHED]
-    mirrored, where, cost = mirrored[first], where[first], cost[first]
+    mirrored, where, cost = starts.mirrored[first], starts.where[first], cost[first]
     scale = np.ones(len(where))
     ways = np.vstack([np.eye(3), -np.eye(3)]) * STEPS
     while scale.max() > 1 / FINEST:
         tried = where[:, None] + ways * scale[:, None, None]
-        costs = _costs(
-            images, shape, np.repeat(mirrored, len(ways)), tried.reshape(-1, 3), middle, config
-        ).sum(axis=0)
+        around = _Places(np.repeat(mirrored, len(ways)), tried.reshape(-1, 3))
+        costs = _costs(images, shape, around, config).sum(axis=0)
         costs = costs.reshape(len(where), -1)
         best, rows = costs.argmin(axis=1), np.arange(len(where))
         better = costs[rows, best] < cost - 1e-9
         where = np.where(better[:, None], tried[rows, best], where)
         cost = np.where(better, costs[rows, best], cost)
         scale = np.where(better, scale, scale / 2)
-    k = int(cost.argmin())
-    beside = _costs(images, shape, mirrored[[k]], where[[k]], middle, config)[1, 0]
-    turned = complex(np.exp(1j * where[k, 0]))
-    arm = np.conj(middle) if mirrored[k] else middle
-    motion = Motion(bool(mirrored[k]), turned, complex(where[k, 1:] @ [1, 1j] - turned * arm))
-    return motion, float(beside)
+    kept: list[int] = []
+    for k in np.argsort(cost, kind="stable"):
+        apart = np.abs(where[kept, 1:] - where[k, 1:]).max(axis=1) > ALIKE_M
+        if (apart | (mirrored[kept] != mirrored[k])).all():
+            kept.append(int(k))
+    return _Places(mirrored[kept], where[kept])
 
 
-def _costs(
-    images: _Images,
-    shape: _Shape,
-    mirrored: NDArray[np.bool_],
-    where: Float,
-    middle: complex,
-    config: AssemblyConfig,
-) -> Float:
-    """(2, t) misfits of (t, 3) places (turn, middle): to the outline, and cloth upon cloth."""
-    turn, centre = np.exp(1j * where[:, 0])[:, None], (where[:, 1:] @ [1, 1j])[:, None]
+def _costs(images: _Images, shape: _Shape, places: _Places, config: AssemblyConfig) -> Float:
+    """(3, t) misfits of the places: to the outline, of cloth upon cloth, of chords."""
+    turn = np.exp(1j * places.where[:, 0])[:, None]
+    centre = (places.where[:, 1:] @ [1, 1j])[:, None]
+    mirrored = places.mirrored[:, None]
 
-    def moved(z: Complex) -> Float:
-        arm = z - middle
-        out = turn * np.where(mirrored[:, None], arm.conj(), arm) + centre
-        return np.stack([out.real, out.imag], axis=-1)
+    def moved(z: Complex) -> Complex:
+        arm = z - shape.middle
+        there: Complex = turn * np.where(mirrored, arm.conj(), arm) + centre
+        return there
 
     sigma = config.misfit_m
-    inner = images.cells(moved(shape.inner))
+    laid = moved(shape.inner)
+    inner = images.cells(laid)
     off = images.signed.take(images.cells(moved(shape.ends))) / sigma
     out = np.maximum(images.signed.take(inner), 0.0) / sigma
-    up = np.where(mirrored[:, None], -shape.up, shape.up)
+    up = np.where(mirrored, -shape.up, shape.up)
     depth = np.where(up > 0, images.taken[0].take(inner), images.taken[1].take(inner))
     over = np.maximum(depth - config.overlap_m, 0.0) * (up != 0) / sigma
     fit = config.end_weight * robust_mean(off, 3.0) + config.inner_weight * robust_mean(out, 3.0)
-    return np.stack([fit, config.overlap_weight * robust_mean(over, 6.0)])
+    upon = config.overlap_weight * robust_mean(over, 6.0)
+    way = _ways_m(images, laid[:, ::THIN], places.mirrored)
+    torn = np.maximum(images.chord_m - way - TORN_M, 0.0) * images.clear / sigma
+    lies = np.abs(laid[:, ::THIN, None] - images.laid)
+    loose = np.log(np.maximum(lies, NEAREST_M) / np.maximum(images.chord_m, NEAREST_M))
+    hung = config.chord_weight * robust_mean(torn, 5.0).mean(axis=-1)
+    hung += config.slack_weight * np.maximum(loose, 0.0).mean(axis=(-2, -1))
+    return np.stack([fit, upon, hung])
+
+
+def _ways_m(images: _Images, laid: Complex, mirrored: NDArray[np.bool_]) -> Float:
+    """(t, i, l) lengths of the ways along the cloth from (t, i) places of the group."""
+    side = np.where(mirrored[:, None, None], ~images.same, images.same)
+    cells = images.ways.at(laid)[:, :, None]
+    ways: Float = images.ways_m[1 - side, cells, np.arange(side.shape[2])]
+    return ways
 
 
 def _images(
-    placed: Sequence[_Shape], motions: Sequence[Motion], outline: Float, shape: _Shape
+    placed: Sequence[_Shape],
+    motions: Sequence[Motion],
+    shape: _Shape,
+    outline: Float,
+    ways: ClothWays,
+    main_m: Float,
 ) -> _Images:
-    sides: list[list[Complex]] = [[], []]
+    cloth: list[list[Complex]] = [[], []]
     for one, motion in zip(placed, motions, strict=True):
         for k in (0, 1):
-            sides[k ^ motion.mirrored].append(motion(one.cloth[k]))
-    taken = [_real(np.concatenate(side)) for side in sides]
+            cloth[k ^ motion.mirrored].append(motion(one.cloth[k]))
+    taken = [_real(np.concatenate(side)) for side in cloth]
     reach = float(np.abs(shape.inner - shape.inner.mean()).max()) + 0.05
     everything = np.vstack([outline, *taken])
     low, high = everything.min(axis=0) - reach, everything.max(axis=0) + reach
@@ -283,13 +365,29 @@ def _images(
     cv2.fillPoly(body, [np.rint((outline - low) / CELL_M).astype(np.int32)], (1,))
     depths = []
     for uv in taken:
-        cloth = np.zeros((rows, cols), np.uint8)
+        image = np.zeros((rows, cols), np.uint8)
         col, row = np.rint((uv - low) / CELL_M).astype(int).T
-        cloth[row, col] = 1
-        closed = cv2.morphologyEx(cloth, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        image[row, col] = 1
+        closed = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
         depths.append(_depth(closed.astype(np.uint8)))
     outside = np.asarray(1 - body, dtype=np.uint8)
-    return _Images(low, _depth(outside) - _depth(body), (depths[0], depths[1]))
+    signed = _depth(outside) - _depth(body)
+    beside = [m(s.inner[::THIN]) for s, m in zip(placed, motions, strict=True)]
+    ways_m = np.concatenate([main_m, *(ways.to(z) for z in beside[1:])], axis=2)
+    up = np.concatenate([(-s.up if m.mirrored else s.up)[::THIN] for s, m in zip(placed, motions)])
+    hangs = np.concatenate([s.hangs[::THIN] for s in placed])
+    sides = np.outer(shape.up[::THIN], up)
+    return _Images(
+        low=low,
+        signed=signed,
+        taken=(depths[0], depths[1]),
+        ways=ways,
+        ways_m=ways_m,
+        laid=np.concatenate(beside),
+        same=sides > 0,
+        clear=sides != 0,
+        chord_m=np.linalg.norm(shape.hangs[::THIN, None] - hangs, axis=2),
+    )
 
 
 def _depth(image: NDArray[np.uint8]) -> Float:
@@ -349,6 +447,7 @@ def _shape(group: Group) -> _Shape:
         spacing,
         cloth[thin],
         group.side[thin],
+        group.points.xyz_hanger[thin],
         (cloth[group.side >= 0], cloth[group.side < 0]),
     )
 

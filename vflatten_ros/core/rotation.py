@@ -59,6 +59,7 @@ from vflatten_ros.core.values import (
 FIRM = 3  # distances along the sheet that place a sample firmly
 FIRM_SHARE = 0.8  # of the samples, for the others to be left out of the outline
 HIDDEN_M = 0.012  # samples round a point of the outline that say whether it is an edge
+HIDDEN_SHARE_AROUND = 0.5  # of the edges round a hole in a placed item, for cloth to be in it
 HIDDEN_SHARE = 0.75  # of the edges there that are hidden, above which it is no edge
 SPUR_M = 0.012  # half the width of what is too narrow for a garment
 SPUR_REACH = 0.8  # how far a corner goes beyond a disc in it, in radii
@@ -71,6 +72,7 @@ CUT = 2.0  # spacings between points of one slit
 WITHIN = 0.5  # share of a group's points in the outline, below which it lies apart
 DEEP_M = 0.020  # how deep within the outline a slit lies, by the middle of its points
 SLIT_M = 0.03  # widest slit of which one side tells what the other is
+WITHIN_M = 0.010  # how far an item may end within an outline that fits it
 RIM_LAID_M = 0.015  # between the two sides of a rim that lies flat as one
 CELL_M = 0.002  # of the image whose contour is the outline
 
@@ -166,6 +168,7 @@ def together(
     points: Sequence[FlatPoints],
     sides: Sequence[Float],
     config: RotationConfig,
+    item: Float | None = None,
 ) -> Unfolded:
     """Several groups as one.
 
@@ -178,6 +181,8 @@ def together(
         Of each group, in that plane.
     sides : sequence of ndarray of shape (n,)
         Of each group's points, there.
+    item : ndarray of shape (c, 2), optional
+        Outline of the item by which they were placed: what lies between them is hidden cloth.
     """
     surface = groups[0].surface
     count = np.array([len(p.uv) for p in points])
@@ -198,7 +203,7 @@ def together(
     row = np.concatenate([g.row for g in groups])
     firm = np.concatenate([g.firm for g in groups])
     side = np.concatenate(sides)
-    outline = _outline(surface, row, all_points, side, firm, config)
+    outline = _outline(surface, row, all_points, side, firm, config, item)
     notices = {notice.code: notice for g in groups for notice in g.notices}
     within = [float(_within(p.uv, outline.uv).mean()) for p in points]
     if min(within) < WITHIN:
@@ -267,7 +272,7 @@ def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationCo
         turned.append(replace(one.points, sigma_m=sigma))
         at += len(one.row)
     planes = tuple(part for one in parts for part in one.parts)
-    return together(parts, planes, turned, [one.side for one in parts], config)
+    return together(parts, planes, turned, [one.side for one in parts], config, rest)
 
 
 def fuse_views(
@@ -485,7 +490,13 @@ def unfolded_from(surface: Surface, part: Part, config: RotationConfig) -> Unfol
 
 
 def _outline(
-    surface: Surface, row: Int, points: FlatPoints, side: Float, firm: Bool, config: RotationConfig
+    surface: Surface,
+    row: Int,
+    points: FlatPoints,
+    side: Float,
+    firm: Bool,
+    config: RotationConfig,
+    item: Float | None = None,
 ) -> Outline:
     """Outline of the samples `row`, which lie where the points are."""
     edge = edges_laid(surface, row, points.uv)
@@ -495,11 +506,16 @@ def _outline(
     links = surface.links.among(laid)
     links = replace(links, a=order[links.a], b=order[links.b])
     cuts = slits(points.uv, side, edge, links, config)
-    return outline_of(points.uv[firm], points.sigma_m[firm], edge[firm], config, cuts)
+    return outline_of(points.uv[firm], points.sigma_m[firm], edge[firm], config, cuts, item)
 
 
 def outline_of(
-    uv: Float, sigma_m: Float, edge: Int, config: RotationConfig, cuts: Sequence[Float] = ()
+    uv: Float,
+    sigma_m: Float,
+    edge: Int,
+    config: RotationConfig,
+    cuts: Sequence[Float] = (),
+    item: Float | None = None,
 ) -> Outline:
     """Where the density of the samples falls to a share of that of a single layer.
 
@@ -511,9 +527,12 @@ def outline_of(
         0: inside a sheet, 1: at an edge of the cloth, 2: where cloth goes on unseen.
     cuts : sequence of ndarray of shape (m, 2)
         Points along slits, which the outline follows if they lead into the item.
+    item : ndarray of shape (c, 2), optional
+        Outline within which all that was not seen is hidden cloth.
     """
-    low = uv.min(0) - 10 * config.edge_blur_m
-    size = np.ceil((uv.max(0) + 10 * config.edge_blur_m - low) / CELL_M).astype(int)
+    extent = uv if item is None else np.vstack([uv, item])
+    low = extent.min(0) - 10 * config.edge_blur_m
+    size = np.ceil((extent.max(0) + 10 * config.edge_blur_m - low) / CELL_M).astype(int)
     if size.max() > 4000:
         raise DisconnectedSurface(f"the flattened item is {size.max() * CELL_M:.1f} m wide")
     column, row = np.rint((uv - low) / CELL_M).astype(int).T
@@ -524,6 +543,8 @@ def outline_of(
     inside = (density > config.edge_density * single).astype(np.uint8)
     gap = round(config.close_m / CELL_M)
     inside = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, _disc(gap))
+    if item is not None:
+        inside |= _hidden(inside, (item - low) / CELL_M, (uv[edge > 0] - low) / CELL_M, edge)
     reach = round(CUT * config.spacing_m / CELL_M)
     inside = _cut(inside, [(cut - low) / CELL_M for cut in cuts], reach)
     inside = _without_spurs(inside, round(SPUR_M / CELL_M))
@@ -537,7 +558,35 @@ def outline_of(
     near = cKDTree(uv).query(contour)[1]
     inferred = _near(contour, uv[edge == 2]) > HIDDEN_SHARE * _near(contour, uv[edge > 0])
     inferred &= ~_before_an_end(contour, inferred)
+    if item is not None:
+        inferred |= cKDTree(uv).query(contour)[0] > HIDDEN_M
     return Outline(contour, sigma_m[near], inferred)
+
+
+def _hidden(inside: NDArray[np.uint8], item: Float, ends: Float, edge: Int) -> NDArray[np.uint8]:
+    """Where cloth of an item (c, 2) was not seen, but goes on all around, in cells.
+
+    Parameters
+    ----------
+    ends : ndarray of shape (e, 2)
+        Of sheets.
+    edge : ndarray of shape (n,)
+        Of all samples, as for outline_of; not 0 for those e.
+    """
+    body, corners = np.zeros_like(inside), np.rint(item).astype(np.int32)
+    cv2.fillPoly(body, [corners], (1,))
+    cv2.polylines(body, [corners], True, (0,))  # legs may touch
+    body = cv2.erode(body, _disc(round(WITHIN_M / CELL_M))) & ~inside & 1
+    count, label = cv2.connectedComponents(body.astype(np.uint8))
+    col, row = np.rint(ends).astype(int).T
+    goes_on = edge[edge > 0] == 2
+    reach = _disc(round(HIDDEN_M / CELL_M))
+    filled = np.zeros_like(inside)
+    for k in range(1, count):
+        beside = cv2.dilate((label == k).astype(np.uint8), reach)[row, col] > 0
+        if goes_on[beside].sum() > HIDDEN_SHARE_AROUND * beside.sum():
+            filled[label == k] = 1
+    return filled
 
 
 def _within(uv: Float, outline: Float) -> Bool:

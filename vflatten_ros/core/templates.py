@@ -59,6 +59,7 @@ class Template:
     side: Float  # (p,) 1 right or middle, -1 left: mirrored
     paths: Mapping[str, tuple[Int, ...]]  # measurement -> its path, and its mirror image
     order: tuple[str, ...]  # measurements that ascend by definition
+    seam: NDArray[np.bool_]  # (k,) front and back hang together from this vertex to the next
     single_sheet: bool = False  # both faces are of one sheet, as a towel's
 
     @property
@@ -281,6 +282,7 @@ class _Reader:
             side=np.array(side),
             paths=paths,
             order=order,
+            seam=self.seam(),
             single_sheet=self.single_sheet(),
         )
         _check_outline(template.outline(np.zeros(template.dimensions)))
@@ -291,6 +293,14 @@ class _Reader:
         if not isinstance(single, bool):
             raise InvalidConfig(f"single_sheet: expected true or false, got {single!r}")
         return single
+
+    def seam(self) -> NDArray[np.bool_]:
+        """Edges that are no openings; none if no opening is described: then nothing is known."""
+        half = [point.get("open", False) for point in self.data["half"][:-1]]
+        for value in half:
+            if not isinstance(value, bool):
+                raise InvalidConfig(f"open: expected true or false, got {value!r}")
+        return ~np.array(half + half[::-1]) if any(half) else np.zeros(2 * len(half), dtype=bool)
 
     def spreads(self) -> tuple[Float, Float]:
         """Typical sizes and how they vary together: a ratio follows the size that it is of."""

@@ -232,6 +232,7 @@ class Flattened:
         default=()
     )  # the largest is the outline's; others are loose
     seen: Coverage | None = None  # None: not known
+    outline_sigma_m: float = 0.0  # error that a whole edge shares, beside that of its points
 
 
 @dataclass(frozen=True)

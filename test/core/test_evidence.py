@@ -1,0 +1,35 @@
+"""Gaps in a flat item, into which its outline goes if it is known there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from flat import lying_at
+
+from vflatten_ros.core.config import RecognitionConfig
+from vflatten_ros.core.evidence import evidence_from
+from vflatten_ros.core.values import Outline
+
+SIDE_M, STEP_M, DEEP_M = 0.3, 0.005, 0.2
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_gap_that_opens_where_the_outline_is_inferred_is_hidden_cloth(hidden):
+    u, v = np.meshgrid(np.arange(0, SIDE_M, STEP_M), np.arange(0, SIDE_M, STEP_M))
+    uv = np.column_stack([u.ravel(), v.ravel()])
+    gap = (uv[:, 0] < DEEP_M) & (np.abs(uv[:, 1] - SIDE_M / 2) < 0.02)
+    points = lying_at(uv[~gap])
+    points.xyz_hanger[:, :2] = points.uv
+    corners = np.array([[0, 0], [SIDE_M, 0], [SIDE_M, SIDE_M], [0, SIDE_M]])
+    share = np.arange(0.0, 1.0, 0.01)[:, None]
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    line = np.vstack([a + share * (b - a) for a, b in sides])
+    mouth = (line[:, 0] < 0.001) & (np.abs(line[:, 1] - SIDE_M / 2) < 0.03)
+    outline = Outline(line, np.full(len(line), 0.004), mouth & hidden)
+    seen = evidence_from(outline, points, RecognitionConfig())
+    deep = np.minimum(seen.outline, SIDE_M - seen.outline).min(axis=1)
+    assert (deep.max() < 0.01) if hidden else (deep.max() > 0.1)
+    # what stays of the outline is where it was
+    assert seen.weight[deep < 0.01].astype(bool).mean() == pytest.approx(
+        0.95 if hidden else 1, abs=0.06
+    )

@@ -145,9 +145,11 @@ def test_the_best_way_is_of_the_category_that_most_speaks_for(method, monkeypatc
 
 def test_the_more_ways_were_tried_the_less_a_dispute_counts():
     placed, hopeless = tried(misfit=-0.3, parts=2), tried(misfit=2.0)
-    assert not settled([placed, hopeless]) and not settled([placed, hopeless, hopeless])
-    assert settled([placed, *[hopeless] * 3])
-    assert not settled([tried(misfit=0.2, parts=2), *[hopeless] * 5])
+    assert not settled([placed, hopeless]) and settled([placed, hopeless, hopeless])
+    unsure = tried(misfit=-0.45, sure=0.85)
+    assert not settled([unsure, hopeless]) and not settled([unsure, *[hopeless] * 2])
+    assert settled([unsure, *[hopeless] * 3])
+    assert not settled([tried(misfit=0.28, parts=2), *[hopeless] * 5])
 
 
 def test_an_outline_that_lies_deep_inside_its_category_is_odd():

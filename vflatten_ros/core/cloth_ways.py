@@ -59,8 +59,7 @@ class ClothWays:
         -------
         ndarray of shape (2, c + 1, l)
             On the same side, and on the other; FAR where no way is known, and all of the last row,
-            which is that of no cell. No way on a flat item of this outline is shorter by more than
-            a cell.
+            which is that of no cell. The shortest way along the cloth is no longer, but for a cell.
         """
         ways = np.full((2, len(self.cells) + 1, len(z)), FAR)
         ways[0, :-1] = self._straight(self.cells, z)

@@ -41,8 +41,9 @@ WAYS = (  # draw of the samples, greatest doubt of what joins pieces
     (1, 1.0),
 )
 FINER = 0.8  # spacing of the samples drawn again, in that of the first
-DISPUTED = -0.5  # badness below which a way that is unsure, placed in groups, or not much better
-YIELDING = 0.15  # than another category settles it; the third way and each further one raise it
+DISPUTED = -0.5  # badness below which a way that is unsure, or not much better than another
+PLACED = -0.35  # category, settles it; below which groups that nothing joins but the category do
+YIELDING = 0.15  # the third way and each further one raise them
 RIVAL = 1.5  # how much worse ways to other categories may be
 MAJORITY = 2  # ways of the best one's category for each such, for them not to count
 UNDECIDED = 0.9  # probability of the best way's category below which it is unsure
@@ -179,9 +180,11 @@ def settled(tries: Sequence[Tried]) -> bool:
     near = [one for one in known if one.badness < best.badness + RIVAL]
     against = sum(one.found.category != best.found.category for one in near)
     agreed = len(near) - against >= MAJORITY * against
-    placed = len(best.unfolded.parts) > 1  # groups that nothing joins but the category
-    disputed = not agreed or placed or best.sure < UNDECIDED
-    limit = DISPUTED + YIELDING * max(0, len(tries) - 2) if disputed else DOUBTFUL
+    limit = DOUBTFUL
+    if not agreed or best.sure < UNDECIDED:
+        limit = DISPUTED + YIELDING * max(0, len(tries) - 2)
+    elif len(best.unfolded.parts) > 1:
+        limit = PLACED + YIELDING * max(0, len(tries) - 2)
     if best.badness >= limit:
         return False
     unseen = float(tries[0].unfolded.outline.inferred.mean())

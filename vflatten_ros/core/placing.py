@@ -41,8 +41,8 @@ TORN_M = 0.02  # excess of a chord over the way along the flat cloth that errors
 END_SIGMA_M = 0.002
 STEPS = np.array([np.radians(8.0), 0.02, 0.02])  # of the search round a place: turn, shift
 FINEST = 16.0  # how much smaller they become
-WORTH_PLACING = 8.0  # cost of the largest group alone beyond the least of all groups, up to which
-# the others are placed beside it: e^-8 is less than any odds that are looked at
+WORTH_PLACING = 8.0  # cost of the largest group alone beyond the least, up to which the others are
+# placed beside it: e^-8 is less than any odds that are looked at
 WORTH_A_TURN = 4.0  # cost beyond the least, up to which a category is fitted and placed again
 
 
@@ -109,6 +109,7 @@ class _Images:
     same: NDArray[np.bool_]  # (i, l) whether some of the group is of its side, if not mirrored
     clear: NDArray[np.bool_]  # (i, l) whether that is known
     chord_m: Float  # (i, l) between them as they hang
+    log_chord: NDArray[np.float32]  # (i, l) logarithm of that, or of NEAREST_M
 
     def cells(self, z: Complex) -> Int:
         """Numbers of the cells at places, or nearest to them."""
@@ -157,7 +158,8 @@ def place_groups(
     -------
     list of Placing
         One for each category that the largest group may belong to. Those that it rules out against
-        the best one have no motions, and a cost that is at least WORTH_PLACING more.
+        another have no motions, and a cost as if the other groups fitted them as they fit the best:
+        WORTH_PLACING above that, or more.
     """
     shapes = [_shape(group) for group in groups]
     main = evidence_from(groups[0].outline, groups[0].points, config.recognition)
@@ -169,18 +171,18 @@ def place_groups(
         stiff = replace(template, swing=STIFF * template.swing)
         for pose, state, energy in _first_fits(stiff, shapes[0], alone):
             fits.append((energy, stiff, pose, state))
-    # each later one: cloth placed beside it makes no fit better, so most need not be placed
     fits.sort(key=lambda fit: fit[0])
-    likely = [fit for fit in fits if fit[0] < fits[0][0] + config.assembly.hopeless]
+    most = min(config.assembly.hopeless, WORTH_PLACING)
+    likely = [fit for fit in fits if fit[0] < fits[0][0] + most]
     first: list[Placing] = []
-    least = np.inf
     for done, (energy, template, pose, state) in enumerate(likely):
         progress("place", 0.4 + 0.4 * done / len(likely))
         placing = Placing(template, pose, state, (), energy)
-        if energy < least + WORTH_PLACING:
-            placing = _fitted(_placed(placing, shapes, config), shapes, main, config)
-            least = min(least, placing.cost)
-        first.append(placing)
+        first.append(_fitted(_placed(placing, shapes, config), shapes, main, config))
+    least, more = min((p.cost, p.cost - fit[0]) for p, fit in zip(first, likely, strict=True))
+    for energy, template, pose, state in fits[len(likely) :]:
+        at_least = max(energy + more, least + WORTH_PLACING)
+        first.append(Placing(template, pose, state, (), at_least))
     found: dict[str, Placing] = {}
     for placing in sorted(first, key=lambda placing: placing.cost):
         found.setdefault(placing.template.category, placing)
@@ -329,8 +331,9 @@ def _costs(images: _Images, shape: _Shape, places: _Places, config: AssemblyConf
     upon = config.overlap_weight * robust_mean(over, 6.0)
     way = _ways_m(images, laid[:, ::THIN], places.mirrored)
     torn = np.maximum(images.chord_m - way - TORN_M, 0.0) * images.clear / sigma
-    lies = np.abs(laid[:, ::THIN, None] - images.laid)
-    loose = np.log(np.maximum(lies, NEAREST_M) / np.maximum(images.chord_m, NEAREST_M))
+    apart = (laid[:, ::THIN, None] - images.laid).astype(np.complex64)
+    lies_m2 = np.maximum(apart.real**2 + apart.imag**2, NEAREST_M**2)
+    loose = 0.5 * np.log(lies_m2) - images.log_chord
     hung = config.chord_weight * robust_mean(torn, 5.0).mean(axis=-1)
     hung += config.slack_weight * np.maximum(loose, 0.0).mean(axis=(-2, -1))
     return np.stack([fit, upon, hung])
@@ -377,6 +380,7 @@ def _images(
     up = np.concatenate([(-s.up if m.mirrored else s.up)[::THIN] for s, m in zip(placed, motions)])
     hangs = np.concatenate([s.hangs[::THIN] for s in placed])
     sides = np.outer(shape.up[::THIN], up)
+    chord = np.linalg.norm(shape.hangs[::THIN, None] - hangs, axis=2)
     return _Images(
         low=low,
         signed=signed,
@@ -386,7 +390,8 @@ def _images(
         laid=np.concatenate(beside),
         same=sides > 0,
         clear=sides != 0,
-        chord_m=np.linalg.norm(shape.hangs[::THIN, None] - hangs, axis=2),
+        chord_m=chord,
+        log_chord=np.log(np.maximum(chord, NEAREST_M)).astype(np.float32),
     )
 
 

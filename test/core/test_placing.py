@@ -175,3 +175,23 @@ def test_what_is_not_placed_would_not_have_been_likely(monkeypatch, leg_first):
     thorough = place_groups(groups, load_templates(), Config())[0]
     assert best.template.category == thorough.template.category == "trousers"
     assert best.cost == thorough.cost and best.motions == thorough.motions
+
+
+def test_what_is_placed_comes_first_however_badly_it_fits_when_placed_again(monkeypatch):
+    _, _, first, second = parted(Motion(False, np.exp(1.9j), 0.8 - 0.4j))
+    fitted = placing._fitted
+    turns = {}
+
+    def worse_the_second_time(placed, *args):
+        turns[placed.template.category] = turns.get(placed.template.category, 0) + 1
+        again = fitted(placed, *args)
+        late = turns[placed.template.category] > placing.WAYS
+        return replace(again, energy=again.energy + 20.0 * late)
+
+    monkeypatch.setattr(placing, "_fitted", worse_the_second_time)
+    placings = place_groups([first, second], load_templates(), Config())
+    assert max(turns.values()) > placing.WAYS
+    placed = [bool(p.motions) for p in placings]
+    assert placed == sorted(placed, reverse=True) and placed[0] and not placed[-1]
+    least = min(p.cost for p in placings if p.motions)
+    assert all(p.cost >= least + placing.WORTH_PLACING for p in placings if not p.motions)

@@ -180,18 +180,21 @@ def place_groups(
         placing = Placing(template, pose, state, (), energy)
         first.append(_fitted(_placed(placing, shapes, config), shapes, main, config))
     least, more = min((p.cost, p.cost - fit[0]) for p, fit in zip(first, likely, strict=True))
-    for energy, template, pose, state in fits[len(likely) :]:
-        at_least = max(energy + more, least + WORTH_PLACING)
-        first.append(Placing(template, pose, state, (), at_least))
+    first += [
+        Placing(t, pose, state, (), energy + more) for energy, t, pose, state in fits[len(likely) :]
+    ]
     found: dict[str, Placing] = {}
-    for placing in sorted(first, key=lambda placing: placing.cost):
+    for placing in sorted(first, key=lambda placing: (not placing.motions, placing.cost)):
         found.setdefault(placing.template.category, placing)
     for done, (category, placing) in enumerate(found.items()):
         progress("place", 0.8 + 0.2 * done / len(found))
-        if placing.cost < least + WORTH_A_TURN:
+        if placing.motions and placing.cost < least + WORTH_A_TURN:
             again = _fitted(_placed(placing, shapes, config), shapes, main, config)
             found[category] = _placed(again, shapes, config)
-    return sorted(found.values(), key=lambda placing: placing.cost)
+    placed = sorted((p for p in found.values() if p.motions), key=lambda placing: placing.cost)
+    at_least = placed[0].cost + WORTH_PLACING
+    others = [replace(p, energy=max(p.energy, at_least)) for p in found.values() if not p.motions]
+    return placed + sorted(others, key=lambda placing: placing.cost)
 
 
 def _first_fits(

@@ -64,8 +64,11 @@ def group(polygon, hidden, motion):
     return Group(points, -side if motion.mirrored else side, outline)
 
 
-def parted(motion):
-    """The trousers without their left leg, and the leg below the cut, moved."""
+def parted(motion, hem_m=0.0):
+    """The trousers without their left leg, and the leg below the cut, moved.
+
+    Of the leg hem_m above its hem are not shown, either.
+    """
     template, state, outline = trousers()
     names = list(template.points[: template.vertices])
     crotch = outline[names.index("crotch")]
@@ -93,10 +96,17 @@ def parted(motion):
         Motion(False, 1.0, 0.0),
     )
     assert "left_thigh" in where
+    if hem_m:
+        hem_outer, hem_inner = (
+            at_height(a, b, hem_m) for a, b in ((thigh, hem_outer), (crotch, hem_inner))
+        )
     leg = np.array([inner, outer, hem_outer, hem_inner])
     if np.cross(leg[1] - leg[0], leg[2] - leg[1]) < 0:
         leg = leg[::-1]
-    second = group(leg, lambda edge: np.abs(edge[:, 1] - height) < 1e-6, motion)
+    cuts = [height, hem_m] if hem_m else [height]
+    second = group(
+        leg, lambda edge: np.any([np.abs(edge[:, 1] - v) < 0.01 for v in cuts], axis=0), motion
+    )
     return template, state, first, second
 
 
@@ -125,6 +135,17 @@ def test_the_second_leg_is_put_where_it_was(mirrored):
     )
     for name in ("width", "length"):
         assert abs(found[name][0] / known[name][0] - 1) < 0.03
+
+
+def test_a_part_of_a_leg_lies_about_as_far_down_as_it_hangs():
+    """Neither hem nor crotch tells, and chords alone would let it lie anywhere farther down."""
+    motion = Motion(False, np.exp(1.9j), 0.8 - 0.4j)
+    *_, first, second = parted(motion, hem_m=0.25)
+    best = place_groups([first, second], load_templates(), Config())[0]
+    assert best.template.category == "trousers"
+    z = best.motions[1](second.points.uv @ np.array([1, 1j]))
+    hangs = second.points.xyz_hanger @ np.array([1, 1j, 0])
+    assert abs(z.mean() - hangs.mean()) < 0.05
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

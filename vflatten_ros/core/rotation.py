@@ -59,8 +59,8 @@ from vflatten_ros.core.values import (
 FIRM = 3  # distances along the sheet that place a sample firmly
 FIRM_SHARE = 0.8  # of the samples, for the others to be left out of the outline
 HIDDEN_M = 0.012  # samples round a point of the outline that say whether it is an edge
-HIDDEN_SHARE_AROUND = 0.5  # of the edges round a hole in a placed item, for cloth to be in it
 HIDDEN_SHARE = 0.75  # of the edges there that are hidden, above which it is no edge
+GOES_ON_SHARE = 0.5  # of the edges round what was not seen of a placed item, for cloth to be there
 SPUR_M = 0.012  # half the width of what is too narrow for a garment
 SPUR_REACH = 0.8  # how far a corner goes beyond a disc in it, in radii
 ROUGH, ROUGH_ROUNDS = 120, 4  # landmarks and reweightings where pieces are laid flat by themselves
@@ -528,7 +528,7 @@ def outline_of(
     cuts : sequence of ndarray of shape (m, 2)
         Points along slits, which the outline follows if they lead into the item.
     item : ndarray of shape (c, 2), optional
-        Outline within which all that was not seen is hidden cloth.
+        Outline within which what was not seen is hidden cloth, if the cloth around goes on there.
     """
     extent = uv if item is None else np.vstack([uv, item])
     low = extent.min(0) - 10 * config.edge_blur_m
@@ -544,7 +544,8 @@ def outline_of(
     gap = round(config.close_m / CELL_M)
     inside = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, _disc(gap))
     if item is not None:
-        inside |= _hidden(inside, (item - low) / CELL_M, (uv[edge > 0] - low) / CELL_M, edge)
+        ends = edge > 0
+        inside |= _hidden(inside, (item - low) / CELL_M, (uv[ends] - low) / CELL_M, edge[ends] == 2)
     reach = round(CUT * config.spacing_m / CELL_M)
     inside = _cut(inside, [(cut - low) / CELL_M for cut in cuts], reach)
     inside = _without_spurs(inside, round(SPUR_M / CELL_M))
@@ -563,15 +564,17 @@ def outline_of(
     return Outline(contour, sigma_m[near], inferred)
 
 
-def _hidden(inside: NDArray[np.uint8], item: Float, ends: Float, edge: Int) -> NDArray[np.uint8]:
-    """Where cloth of an item (c, 2) was not seen, but goes on all around, in cells.
+def _hidden(
+    inside: NDArray[np.uint8], item: Float, ends: Float, goes_on: Bool
+) -> NDArray[np.uint8]:
+    """Cells within an item's outline (c, 2) that were not seen, where the cloth around goes on.
 
     Parameters
     ----------
     ends : ndarray of shape (e, 2)
-        Of sheets.
-    edge : ndarray of shape (n,)
-        Of all samples, as for outline_of; not 0 for those e.
+        Where sheets end.
+    goes_on : ndarray of shape (e,)
+        Whether the cloth does not.
     """
     body, corners = np.zeros_like(inside), np.rint(item).astype(np.int32)
     cv2.fillPoly(body, [corners], (1,))
@@ -579,12 +582,11 @@ def _hidden(inside: NDArray[np.uint8], item: Float, ends: Float, edge: Int) -> N
     body = cv2.erode(body, _disc(round(WITHIN_M / CELL_M))) & ~inside & 1
     count, label = cv2.connectedComponents(body.astype(np.uint8))
     col, row = np.rint(ends).astype(int).T
-    goes_on = edge[edge > 0] == 2
     reach = _disc(round(HIDDEN_M / CELL_M))
     filled = np.zeros_like(inside)
     for k in range(1, count):
         beside = cv2.dilate((label == k).astype(np.uint8), reach)[row, col] > 0
-        if goes_on[beside].sum() > HIDDEN_SHARE_AROUND * beside.sum():
+        if goes_on[beside].sum() > GOES_ON_SHARE * beside.sum():
             filled[label == k] = 1
     return filled
 

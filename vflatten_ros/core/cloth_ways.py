@@ -40,12 +40,7 @@ class ClothWays:
 
     def at(self, z: Complex) -> Int:
         """Cells of places; -1 beyond the item."""
-        rows, cols = self.number.shape
-        col = np.rint((z.real - self.low[0]) / CELL_M).astype(np.int64)
-        row = np.rint((z.imag - self.low[1]) / CELL_M).astype(np.int64)
-        inside = (col >= 0) & (col < cols) & (row >= 0) & (row < rows)
-        number = self.number[row.clip(0, rows - 1), col.clip(0, cols - 1)]
-        cell: Int = np.where(inside, number, -1)
+        cell: Int = self.number[self._nearest(z)]  # at the grid's border there is no item
         return cell
 
     def to(self, z: Complex) -> Float:
@@ -75,19 +70,20 @@ class ClothWays:
         """(n, m) lengths of straight ways, FAR where one leaves the cloth."""
         away: Float = np.abs(start[:, None] - end)
         for share in ALONG:
-            away[self._beyond((1 - share) * start[:, None] + share * end)] = FAR
+            between = self._nearest((1 - share) * start[:, None] + share * end)
+            away[self.signed_m[between] > BESIDE_M] = FAR
         for inner, outer in self.pockets:
             away[_crossing(start[:, None], end, inner, outer)] = FAR
             away[_from_line_m(start, inner, outer) < BESIDE_M] = FAR  # of which leg it is
             away[:, _from_line_m(end, inner, outer) < BESIDE_M] = FAR  # is not certain
         return away
 
-    def _beyond(self, z: Complex) -> Bool:
+    def _nearest(self, z: Complex) -> tuple[Int, Int]:
+        """Rows and columns of the grid nearest to places."""
         rows, cols = self.number.shape
         col = np.rint((z.real - self.low[0]) / CELL_M).astype(np.int64).clip(0, cols - 1)
         row = np.rint((z.imag - self.low[1]) / CELL_M).astype(np.int64).clip(0, rows - 1)
-        beyond: Bool = self.signed_m[row, col] > BESIDE_M
-        return beyond
+        return row, col
 
 
 def cloth_ways(outline: Float, seam: Bool, single_sheet: bool) -> ClothWays:

@@ -413,7 +413,7 @@ class AssemblyConfig(Checked):
     )
     chord_weight: float = option(
         60.0,
-        "The same for points of one side, which must not hang farther apart than they lie.",
+        "The same for how much farther apart points hang than it is along the cloth.",
         low=0.0,
         high=10000.0,
     )

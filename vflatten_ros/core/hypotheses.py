@@ -41,11 +41,8 @@ WAYS = (  # draw of the samples, greatest doubt of what joins pieces
     (1, 1.0),
 )
 FINER = 0.8  # spacing of the samples drawn again, in that of the first
-DISPUTED = (
-    -0.5
-)  # badness below which a way settles it that is unsure, or hardly better than another
-# category's
-PLACED = -0.35  # the same of groups that nothing joins but the category
+DISPUTED = -0.5  # badness below which a way that is unsure, or has rivals, settles it
+PLACED = -0.35  # the same for groups that nothing joins but the category
 YIELDING = 0.15  # by which the third way and each further one raise these two
 RIVAL = 1.5  # how much worse ways to other categories may be
 MAJORITY = 2  # ways of the best one's category for each such, for them not to count

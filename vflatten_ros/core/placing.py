@@ -2,8 +2,8 @@
 
 Every group lies flat by itself, front and back. Its ends lie on the outline of the whole item, its
 cloth inside, and not on cloth of the same side. And no two points hang farther apart than it is
-along the cloth (`cloth_ways`). The category's outline is fitted to the
-largest group, the others are tried all over it, either way up, and the outline is fitted to all.
+along the cloth (`cloth_ways`). The category's outline is fitted to the largest group, the others
+are tried all over it, either way up, and the outline is fitted to all.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import pytest
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.distances import largest_pieces, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
-from vflatten_ros.core.sheets import link_samples
+from vflatten_ros.core.sheets import Links, link_samples
 
 CONFIG = RotationConfig(landmarks=60)
 
@@ -50,6 +50,16 @@ def test_far_distances_over_landmarks_are_hardly_too_long():
     true = np.linalg.norm(at[:, None] - at[None], axis=2)
     ratio = found.bound_m[true > 0.25] / true[true > 0.25]
     assert 0.995 < np.median(ratio) < 1.01
+
+
+def test_a_string_of_samples_is_no_surface():
+    n = 200
+    xyz = np.column_stack([np.arange(n) * 0.008, np.zeros((n, 2))])
+    normal = np.tile([0.0, 0.0, 1.0], (n, 1))
+    at = np.arange(n - 1)
+    along = Links(at, at + 1, np.full(n - 1, 0.008), np.zeros(n - 1, dtype=bool), np.zeros(n - 1))
+    with pytest.raises(DisconnectedSurface, match="0 of 200 samples hang on others"):
+        surface_distances(xyz, normal, along, np.ones(n, dtype=bool), CONFIG)
 
 
 def test_two_sheets_far_apart_raise():

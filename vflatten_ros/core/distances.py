@@ -25,6 +25,7 @@ Float32 = NDArray[np.float32]
 PLACED_BY = 10  # landmarks that place a sample
 LEAST_INSIDE = 0.4  # of the samples in the largest piece
 FIRM_LINKS = 6  # links on the sheet that a landmark needs
+LEAST_FIRM = 4  # such samples, to lay anything flat by
 GROUP = 16  # landmarks whose paths are laid out together: bounds the memory
 MEET_AT = 2  # every such sample is one where paths may meet: laid out, they are straight anyhow
 BLOCK = 512  # samples whose nearest landmarks are found together, so that they stay in the cache
@@ -170,7 +171,7 @@ def surface_distances(
     Raises
     ------
     DisconnectedSurface
-        Fewer than LEAST_INSIDE of the passable samples hang together.
+        Fewer than LEAST_INSIDE of the passable samples hang together, or hardly any firmly.
     """
     progress("distances", 0.0)
     count = len(xyz)
@@ -191,6 +192,11 @@ def surface_distances(
     both = passable[a] & passable[b] & ~rim
     degree = np.bincount(np.r_[a[both], b[both]], minlength=count)
     firm = inside & (degree >= FIRM_LINKS)
+    if firm.sum() < LEAST_FIRM:
+        raise DisconnectedSurface(
+            f"{firm.sum()} of {inside.sum()} samples hang on others on all sides; take more views "
+            "or raise rotation.link_m"
+        )
     inside[end[inside[start]]] = True
     link_m = float(length_m.max())
     reach_m = (config.local_m + link_m) / 2  # two paths meet half way

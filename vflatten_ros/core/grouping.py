@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.distances import largest_pieces, surface_distances
+from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.puzzle import CELL_M as PUZZLE_CELL_M
 from vflatten_ros.core.puzzle import Motion, Ties, put_together
 from vflatten_ros.core.rotation import (
@@ -57,10 +58,17 @@ def group_pieces(
     surface : Surface
     doubt : float
         What is more doubtful than this joins nothing.
+
+    Raises
+    ------
+    DisconnectedSurface
+        No piece is worth a look.
     """
     samples, links = surface.samples, surface.links
     passable, sheet = passable_at(surface, doubt), links.part(~links.rim)
     found = largest_pieces(sheet, passable, int(SMALLEST * len(samples.xyz)))
+    if not found:
+        raise _in_shreds(len(samples.xyz))
     flat = []
     for k, piece in enumerate(found):
 
@@ -84,12 +92,21 @@ def group_pieces(
     believed[between] = _along_agreeing(samples.xyz, ties, a[between], b[between], puzzle.met)
     size = np.bincount(puzzle.group[puzzle.group >= 0])
     order = [k for k in np.argsort(-size, kind="stable") if size[k] > SMALLEST * len(number)]
+    if not order:
+        raise _in_shreds(len(number))
     masks = tuple(puzzle.group == k for k in order)
     return Grouped(
         surface,
         links.part(~links.rim | believed),
         masks,
         np.column_stack([puzzle.z.real, puzzle.z.imag]),
+    )
+
+
+def _in_shreds(count: int) -> DisconnectedSurface:
+    return DisconnectedSurface(
+        f"no piece of the surface has more than {SMALLEST:.0%} of its {count} samples; take more "
+        "views or raise rotation.link_m"
     )
 
 

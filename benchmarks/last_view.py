@@ -5,8 +5,7 @@
     python3 benchmarks/last_view.py RECORDING [RECORDING ...] [--rounds 3] [--docs]
 
 Views are prepared and folded in before, as they are while the wrist turns. Wall time, the best of
-some rounds; CPU time beside it, since two threads share the work. `--docs` writes the table of
-docs/benchmarks.md.
+some rounds, without and with the helper process. `--docs` writes the table of docs/benchmarks.md.
 """
 
 # ruff: noqa: E402  (threads must be limited before numpy is imported)
@@ -24,9 +23,10 @@ threads.use_one()
 
 import argparse
 import os
-import resource
+import re
+import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing import get_context
 
 from report import row, table_head, write_part
@@ -36,15 +36,19 @@ from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.pipeline import flatten_garment, prepare_view
 from vflatten_ros.core.registration import ViewSurface, fold_in
+from vflatten_ros.core.values import no_progress
 from vflatten_ros.files import calibration_beside, load_calibration
+from vflatten_ros.helper import HelperProcess
+from vflatten_ros.processes import keep_little
 from vflatten_ros.progress import Stages
-from vflatten_ros.worker import KEPT_BYTES
 
 PAGE = ROOT / "docs" / "benchmarks.md"
 ABOUT = """
 Written by `python3 benchmarks/last_view.py RECORDING ... --docs`: wall seconds of `rotation` after
-the views are prepared and folded in, the best of some rounds. Stages that every way of laying the
-item flat goes through are summed over the ways that it took.
+the views are prepared and folded in, the best of some rounds. Stages, and their sum in one process,
+are without the helper process; those that every way of laying the item flat goes through are summed
+over the ways that it took. The memory is the most in use at any time, libraries that both processes
+share counted once.
 """
 TOGETHER = {
     "register, fuse": ("surface", "register", "fuse"),
@@ -77,12 +81,21 @@ class Run:
     cpu_s: float
     gap_s: float
     category: str
+    stages: dict[str, float]
+
+
+@dataclass
+class Measured:
+    """The fastest flattening by one process, and by two."""
+
+    alone: Run
+    both: Run
     prepare_s: float  # a view, before
-    memory_mb: float = 0.0  # most of the process
-    stages: dict[str, float] = field(default_factory=dict)
+    alone_mb: float
+    both_mb: float
 
 
-def measure(folder: Path, rounds: int) -> Run:
+def measure(folder: Path, rounds: int) -> Measured:
     """The fastest of some runs."""
     config, templates = Config(), load_templates()
     rig = load_calibration(calibration_beside(folder))
@@ -94,16 +107,54 @@ def measure(folder: Path, rounds: int) -> Run:
         prepared[view.view_id] = prepare_view(view, config)
         so_far = fold_in(list(prepared.values()), config.rotation, so_far)
     each = (time.perf_counter() - begin) / len(views)
-    runs = []
-    for _ in range(rounds):
-        wall, cpu, stages = time.perf_counter(), time.process_time(), Watched()
-        garment = flatten_garment(views, (), templates, config, stages, prepared, so_far)
-        stages.stop()
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        runs.append(Run(wall, cpu, stages.gap_s, garment.category, each, stages=stages.seconds))
-    best = min(runs, key=lambda run: run.wall_s)
-    best.memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    return best
+
+    def fastest(helper: HelperProcess | None) -> Run:
+        runs = []
+        for _ in range(rounds):
+            wall, cpu, stages = time.perf_counter(), time.process_time(), Watched()
+            garment = flatten_garment(
+                views, (), templates, config, stages, prepared, so_far, helper
+            )
+            stages.stop()
+            wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+            runs.append(Run(wall, cpu, stages.gap_s, garment.category, stages.seconds))
+        return min(runs, key=lambda run: run.wall_s)
+
+    alone = fastest(None)
+    with Memory("self") as alone_mb:
+        flatten_garment(views, (), templates, config, no_progress, prepared, so_far)
+    with HelperProcess() as helper:
+        helper.wait_until_ready(60.0)
+        both = fastest(helper)
+        with Memory("self", str(helper.pid)) as both_mb:
+            flatten_garment(views, (), templates, config, no_progress, prepared, so_far, helper)
+    return Measured(alone, both, each, alone_mb.most, both_mb.most)
+
+
+class Memory:
+    """The most memory that processes had together while the context lasted, MB.
+
+    What they share (libraries) counts once.
+    """
+
+    def __init__(self, *processes: str) -> None:
+        self._files = [Path(f"/proc/{process}/smaps_rollup") for process in processes]
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+        self.most = 0.0
+
+    def __enter__(self) -> Memory:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._over.wait(0.01):
+            shares = re.findall(r"^Pss: +(\d+)", "".join(f.read_text() for f in self._files), re.M)
+            self.most = max(self.most, sum(map(int, shares)) * 1.024e-3)
 
 
 def main() -> int:
@@ -112,19 +163,20 @@ def main() -> int:
     options.add_argument("--rounds", type=int, default=3)
     options.add_argument("--docs", action="store_true", help="write docs/benchmarks.md")
     args = options.parse_args()
-    lines = table_head(
-        "", ["recording", "result", *TOGETHER, "all", "CPU", "longest without a report", "MB"]
-    )[-2:]
+    ends = ["one process", "its CPU", "two", "longest without a report", "MB, one", "MB, two"]
+    lines = table_head("", ["recording", "result", *TOGETHER, *ends])[-2:]
     print("\n".join(lines))
     slowest = 0.0
-    os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(KEPT_BYTES))  # as the node's process has it
+    keep_little(os.environ)  # as the node's process has it
     for folder in args.recordings:
         with get_context("spawn").Pool(1) as pool:  # its own process: memory is its own, too
-            run = pool.apply(measure, (folder, args.rounds))
-        slowest = max(slowest, run.prepare_s)
-        shares = [sum(run.stages.get(s, 0.0) for s in stages) for stages in TOGETHER.values()]
-        times = [f"{s:.2f}" for s in (*shares, run.wall_s, run.cpu_s, run.gap_s)]
-        lines.append(row([folder.name, run.category, *times, f"{run.memory_mb:.0f}"]))
+            got = pool.apply(measure, (folder, args.rounds))
+        slowest = max(slowest, got.prepare_s)
+        alone, both = got.alone, got.both
+        shares = [sum(alone.stages.get(s, 0.0) for s in stages) for stages in TOGETHER.values()]
+        seconds = [*shares, alone.wall_s, alone.cpu_s, both.wall_s, max(alone.gap_s, both.gap_s)]
+        memory = [f"{got.alone_mb:.0f}", f"{got.both_mb:.0f}"]
+        lines.append(row([folder.name, both.category, *(f"{s:.2f}" for s in seconds), *memory]))
         print(lines[-1], flush=True)
     about = (
         f"{os.cpu_count()} cores, load average {os.getloadavg()[0]:.1f} with this; preparing a "

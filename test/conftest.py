@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from vflatten_ros import threads
+
+threads.use_one()  # as the commands do, before numpy is imported
+
 ROS_TESTS = Path(__file__).parent / "ros"
 HAS_ROS = importlib.util.find_spec("rclpy") is not None
 

@@ -31,7 +31,7 @@ def calls(monkeypatch):
         noted.folded.append(list(surfaces))
         return tuple(surfaces)
 
-    def flatten_garment(views, pairs, templates, config, progress, prepared, so_far):
+    def flatten_garment(views, pairs, templates, config, progress, prepared, so_far, helper):
         noted.given, noted.so_far = dict(prepared), so_far
         return garments.example_garment()
 

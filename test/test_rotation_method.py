@@ -11,7 +11,7 @@ from recordings import BAGS
 
 from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core import hypotheses, parallel, pipeline, rotation
+from vflatten_ros.core import parallel, pipeline, rotation, ways
 from vflatten_ros.core.config import Config
 from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.replay import replay_recording
@@ -90,9 +90,9 @@ def test_views_in_order_are_enough_only_once_the_answer_is_right(name, wrong_at,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ways", "least", "most"), [(1, 0.04, 0.08), (6, 0.0, 0.02)])
-def test_layers_that_lie_flush_spoil_the_skirt_unless_they_are_looked_for(ways, least, most):
-    dense = dataclasses.replace(ALL_VIEWS.rotation, spacing_m=0.004, link_m=0.0088, ways=ways)
+@pytest.mark.parametrize(("most_ways", "least", "most"), [(1, 0.04, 0.08), (6, 0.0, 0.02)])
+def test_layers_that_lie_flush_spoil_the_skirt_unless_they_are_looked_for(most_ways, least, most):
+    dense = dataclasses.replace(ALL_VIEWS.rotation, spacing_m=0.004, link_m=0.0088, ways=most_ways)
     config = dataclasses.replace(ALL_VIEWS, rotation=dense)
     garment = replay_recording(BAGS / "SK2_1", config).garment
     assert least < max(errors(garment, BAGS / "SK2_1")[1]) < most
@@ -101,13 +101,16 @@ def test_layers_that_lie_flush_spoil_the_skirt_unless_they_are_looked_for(ways, 
 @pytest.mark.slow
 def test_a_leg_that_hangs_by_hidden_cloth_is_put_in_its_place(monkeypatch):
     """The trousers as if what joins their legs were in doubt."""
-    monkeypatch.setattr(hypotheses, "WAYS", ((0, 1.0),))
+    monkeypatch.setattr(ways, "WAYS", ((0, 1.0),))
+    one_way = dataclasses.replace(
+        ALL_VIEWS, rotation=dataclasses.replace(ALL_VIEWS.rotation, ways=1)
+    )
     parts = []
     monkeypatch.setattr(
         pipeline, "turn_parts", lambda *args: parts.append(rotation.turn_parts(*args)) or parts[-1]
     )
     folder = BAGS / "TR1_1"
-    placed = replay_recording(folder, ALL_VIEWS).garment
+    placed = replay_recording(folder, one_way).garment
     monkeypatch.undo()
     whole = replay_recording(folder, ALL_VIEWS).garment
     assert all(len(turned.parts) == 2 for turned in parts) and len(parts) > 0
@@ -117,6 +120,16 @@ def test_a_leg_that_hangs_by_hidden_cloth_is_put_in_its_place(monkeypatch):
     # a leg as it was placed is less certain than one that hangs on the rest
     for name in ("width", "length"):
         assert placed.measurement(name).sigma_m > whole.measurement(name).sigma_m
+
+
+@pytest.mark.parametrize(
+    ("name", "few"),
+    [("SK2_1", (0, 4, 8)), ("SK2_1", (1, 5, 9)), ("SK2_1", (3, 10)), ("SH1_1", (7, 17))],
+)
+def test_views_that_tell_too_little_are_said_to(name, few):
+    """Some ways find no piece that is large enough, or hangs together firmly enough."""
+    garment = replay_recording(BAGS / name, ALL_VIEWS, view_ids=few).garment
+    assert untrusted(garment) and not garment.enough
 
 
 @pytest.mark.slow

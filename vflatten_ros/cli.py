@@ -12,6 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib import import_module, metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from vflatten_ros import resources, threads
 from vflatten_ros.core.config import METHODS, Config
 from vflatten_ros.core.errors import VFlattenError
+from vflatten_ros.helper import HelperProcess
 from vflatten_ros.progress import Stages
 
 if TYPE_CHECKING:
@@ -93,6 +95,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     replay.add_argument("--cloud-topic", metavar="TOPIC", help="default: the only one")
     replay.add_argument("--joint-topic", metavar="TOPIC", help="default: the only one")
+    replay.add_argument(
+        "--processes", type=int, choices=(1, 2), default=2,
+        help="with 2 (default), one tries other ways of laying the item flat meanwhile (method "
+        "rotation); the result is the same",
+    )  # fmt: skip
     _add_common(replay)
 
     flatten = commands.add_parser("flatten", help="flatten what one cloud shows, without a robot")
@@ -128,7 +135,9 @@ def _replay(args: argparse.Namespace) -> None:
 
     _prepare_outputs(args)
     config = _config(args, "kita2019" if args.protocol else None)
-    with Stages(_show_bar(args)) as stages:
+    alone = args.processes == 1 or config.method != "rotation"
+    helping = nullcontext() if alone else HelperProcess()
+    with helping as helper, Stages(_show_bar(args)) as stages:
         replayed = replay_recording(
             args.recording,
             config,
@@ -139,6 +148,7 @@ def _replay(args: argparse.Namespace) -> None:
             joint_topic=args.joint_topic,
             progress=stages,
             warn=stages.warn,
+            helper=helper,
         )
         _write(args, replayed, stages)
     _report(args, replayed, stages)

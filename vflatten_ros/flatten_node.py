@@ -43,7 +43,7 @@ from vflatten_ros.node_outputs import (
     flattening_status,
 )
 from vflatten_ros.node_services import Services, summary
-from vflatten_ros.parameters import CalibrationOptions, Parameters, Settings
+from vflatten_ros.parameters import CalibrationOptions, NodeOptions, Parameters, Settings
 from vflatten_ros.session import NOT_ACTIVE, Refused, Session
 from vflatten_ros.worker import Load, Outcome, Worker
 
@@ -55,7 +55,9 @@ NAMESAKE_S = 30.0  # a node that was killed stays visible for 20 s
 class FlattenNode(AnsweringLifecycleNode):
     """Everything runs in one thread, the executor's; flattening runs in another process."""
 
-    def __init__(self, name: str = "vflatten", loader: Callable[[str], Load] | None = None) -> None:
+    def __init__(
+        self, name: str = "vflatten", loader: Callable[[NodeOptions], Load] | None = None
+    ) -> None:
         """Create the node, unconfigured.
 
         Parameters
@@ -63,7 +65,7 @@ class FlattenNode(AnsweringLifecycleNode):
         name : str
             Node name, unless remapped.
         loader : callable, optional
-            Folder of the categories -> what the flattening process loads; for tests.
+            The node's options -> what the flattening process loads; for tests.
 
         Raises
         ------
@@ -150,9 +152,7 @@ class FlattenNode(AnsweringLifecycleNode):
         """Check the categories and start the flattening process."""
         options = self.settings.node.node
         load_templates(options.categories or None)
-        worker = Worker(
-            self._loader(options.categories), self._worker_guard.trigger, options.worker_nice
-        )
+        worker = Worker(self._loader(options), self._worker_guard.trigger, options.worker_nice)
         self.goals = Goals(worker, lambda: self.settings.node.node.max_queued_goals)
 
     def activate(self) -> None:
@@ -371,7 +371,7 @@ class FlattenNode(AnsweringLifecycleNode):
         super().destroy_node()
 
 
-def _loader(categories: str) -> Load:
+def _loader(options: NodeOptions) -> Load:
     from vflatten_ros import job
 
-    return partial(job.load, categories)
+    return partial(job.load, options.categories, options.worker_processes)

@@ -13,16 +13,19 @@ from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import FlatGarment, Progress, View
+from vflatten_ros.helper import HelperProcess
 from vflatten_ros.messages import fill, message_class
 from vflatten_ros.outputs import TYPES, result_messages
 from vflatten_ros.worker import Job
 
 if TYPE_CHECKING:
+    from vflatten_ros.core.hypotheses import Helper
     from vflatten_ros.core.registration import Folded, ViewSurface
 
 
-def load(categories: str) -> Flattening:
+def load(categories: str, processes: int = 1) -> Flattening:
     """Ready for work with the categories of a folder ("": those of the package)."""
+    helper = HelperProcess() if processes > 1 else None  # it loads meanwhile
     # now, so that the first job need not wait for it
     from rclpy.serialization import serialize_message
 
@@ -31,14 +34,14 @@ def load(categories: str) -> Flattening:
     for name in TYPES.values():
         serialize_message(message_class(name)())
 
-    return Flattening(load_templates(categories or None))
+    return Flattening(load_templates(categories or None), helper)
 
 
 class Flattening:
     """The method, with views folded in as they arrive; the numbers are the same without."""
 
-    def __init__(self, templates: Sequence[Template]) -> None:
-        self._templates = templates
+    def __init__(self, templates: Sequence[Template], helper: Helper | None = None) -> None:
+        self._templates, self._helper = templates, helper
         # goes with its view
         self._prepared: WeakKeyDictionary[View, _Prepared] = WeakKeyDictionary()
         self._folded: Folded | None = None
@@ -76,7 +79,14 @@ class Flattening:
         prepared = {view_id: surface for view_id, surface in of_views if surface is not None}
         folded = self._fold(list(prepared.values()), job.config) if prepared else None
         garment = flatten_garment(
-            views, job.correspondences, self._templates, job.config, progress, prepared, folded
+            views,
+            job.correspondences,
+            self._templates,
+            job.config,
+            progress,
+            prepared,
+            folded,
+            self._helper,
         )
         progress("messages", 0.0)
         return garment, serialized(garment, views)

@@ -20,6 +20,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from vflatten_ros import transport
 from vflatten_ros.core.errors import VFlattenError
 from vflatten_ros.flatten_node import FlattenNode
+from vflatten_ros.parameters import NodeOptions
 from vflatten_ros.worker import Load
 
 MAX_ERRORS = 1000  # in a row
@@ -47,7 +48,9 @@ def spin(node: FlattenNode) -> None:
                 raise
 
 
-def main(argv: Sequence[str] | None = None, loader: Callable[[str], Load] | None = None) -> int:
+def main(
+    argv: Sequence[str] | None = None, loader: Callable[[NodeOptions], Load] | None = None
+) -> int:
     """Run the node.
 
     Parameters

@@ -51,6 +51,14 @@ class NodeOptions(Checked):
         low=0,
         high=100,
     )
+    worker_processes: int = option(
+        2,
+        "Processes that flatten; with 2, one tries other ways of laying the item flat meanwhile "
+        "(method rotation). The result is the same.",
+        low=1,
+        high=2,
+        read_only=True,
+    )
     worker_nice: int = option(
         5,
         "How far the flattening process gives way to others (nice).",

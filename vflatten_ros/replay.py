@@ -20,6 +20,7 @@ from vflatten_ros.core.errors import (
     InvalidRecording,
     NotEnoughViews,
 )
+from vflatten_ros.core.hypotheses import Helper
 from vflatten_ros.core.parallel import THREADS
 from vflatten_ros.core.pipeline import flatten_garment, prepare_view
 from vflatten_ros.core.registration import ViewSurface
@@ -55,6 +56,7 @@ def replay_recording(
     joint_topic: str | None = None,
     progress: Progress = no_progress,
     warn: Callable[[str], None] = lambda text: None,
+    helper: Helper | None = None,
 ) -> Replayed:
     """Flatten the item of a recorded rotation.
 
@@ -74,6 +76,8 @@ def replay_recording(
     progress : Progress
     warn : callable
         Told what went wrong and could be worked round.
+    helper : Helper, optional
+        Another process that shares the work of method rotation.
 
     Raises
     ------
@@ -102,7 +106,7 @@ def replay_recording(
             )
         kept = _check_pairs(pairs, views, protocol, warn)
         prepared = preparation.of(views, progress)
-    garment = flatten_garment(views, kept, templates, config, progress, prepared)
+    garment = flatten_garment(views, kept, templates, config, progress, prepared, helper=helper)
     return Replayed(
         garment=garment,
         views=views,

@@ -25,11 +25,9 @@ from typing import Any, Protocol
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import Cancelled, VFlattenError
 from vflatten_ros.core.values import Correspondence, FlatGarment, Progress, View
+from vflatten_ros.processes import keep_little
 
 PROGRESS_PERIOD_S = 0.05
-# glibc gives larger arrays back when they are freed; left to itself it soon keeps most of them, and
-# those of each thread for that thread alone: half as much memory again
-KEPT_BYTES = 4 << 20
 STOP = (
     signal.SIGUSR1
 )  # from the process to itself: the main thread looks whether its job is cancelled
@@ -176,7 +174,7 @@ class Worker:
     def _start(self) -> None:
         context = get_context("spawn")
         ours, theirs = context.Pipe()
-        os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(KEPT_BYTES))  # read as a process starts
+        keep_little(os.environ)  # read as a process starts
         self._process = context.Process(
             target=serve, args=(theirs, self._load, self._nice), daemon=True, name="flatten"
         )

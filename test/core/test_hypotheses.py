@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from flat import lying_at
 
-from vflatten_ros.core import hypotheses
+from vflatten_ros.core import hypotheses, ways
+from vflatten_ros.core import tried as judging
 from vflatten_ros.core.config import Config, RotationConfig
-from vflatten_ros.core.hypotheses import Tried, rival, settled
+from vflatten_ros.core.errors import Cancelled, DisconnectedSurface
+from vflatten_ros.core.tried import Tried
 
 
 def tried(
@@ -56,6 +58,14 @@ def tried(
         ),
     )
     return Tried(unfolded, found, aside)
+
+
+def settled(tries):
+    return judging.settled([one.verdict for one in tries])
+
+
+def rival(tries):
+    return judging.rival([one.verdict for one in tries])
 
 
 def test_all_that_is_wrong_with_a_way_counts():
@@ -132,13 +142,13 @@ def test_two_ways_outvote_one_that_disagrees():
 
 def test_the_best_way_is_of_the_category_that_most_speaks_for(method, monkeypatch):
     """Two ways to a towel count more than one to a skirt that is a little better, not much."""
-    ways = iter([tried(misfit=0.7, category="skirt"), tried(misfit=0.8), tried(misfit=0.9)])
-    monkeypatch.setattr(hypotheses._Draw, "tried", lambda *_: next(ways))
+    results = iter([tried(misfit=0.7, category="skirt"), tried(misfit=0.8), tried(misfit=0.9)])
+    monkeypatch.setattr(ways._Draw, "tried", lambda *_: next(results))
     three = replace(Config(), rotation=RotationConfig(ways=3))
     best = hypotheses.likeliest(0, (), three, lambda *_: None)
     assert best.found.category == "towel" and best.found.fit.misfit == 0.8
     assert best.rival == "skirt"
-    ways = iter([tried(misfit=0.4, category="skirt"), tried(misfit=1.2), tried(misfit=1.3)])
+    results = iter([tried(misfit=0.4, category="skirt"), tried(misfit=1.2), tried(misfit=1.3)])
     best = hypotheses.likeliest(0, (), three, lambda *_: None)
     assert best.found.category == "skirt" and best.rival == ""
 
@@ -192,23 +202,23 @@ def method(monkeypatch):
         noted.found.append(surface)
         return tried(misfit=noted.misfit.get(surface.draw, 0.5))
 
-    monkeypatch.setattr(hypotheses, "drawn_again", drawn_again)
-    monkeypatch.setattr(hypotheses, "link_surface", linked)
-    monkeypatch.setattr(hypotheses, "doubts", lambda *_: noted.ramps.append(1) or 2.0)
-    monkeypatch.setattr(hypotheses, "unfold_surface", lambda surface, *_: surface)
-    monkeypatch.setattr(hypotheses, "group_pieces", lambda surface, *_: surface)
-    monkeypatch.setattr(hypotheses, "_recognised", recognised)
-    monkeypatch.setattr(hypotheses._Draw, "_from_groups", lambda _, one: recognised(one))
+    monkeypatch.setattr(ways, "drawn_again", drawn_again)
+    monkeypatch.setattr(ways, "link_surface", linked)
+    monkeypatch.setattr(ways, "doubts", lambda *_: noted.ramps.append(1) or 2.0)
+    monkeypatch.setattr(ways, "unfold_surface", lambda surface, *_: surface)
+    monkeypatch.setattr(ways, "group_pieces", lambda surface, *_: surface)
+    monkeypatch.setattr(ways, "_recognised", recognised)
+    monkeypatch.setattr(ways._Draw, "_from_groups", lambda _, one, progress: recognised(one))
     return noted
 
 
 @pytest.mark.parametrize(("misfit", "looked"), [(-0.5, 0), (0.5, 1)])
 def test_ramps_are_looked_for_once_and_only_where_the_first_way_does_not_settle_it(
-    monkeypatch, method, misfit, looked
+    method, misfit, looked
 ):
     method.misfit = {0: misfit}
-    monkeypatch.setattr(hypotheses, "WAYS", ((0, np.inf), (0, 1.0), (0, 0.4)))
-    hypotheses.likeliest(0, (), Config(), lambda *_: None)
+    three = replace(Config(), rotation=RotationConfig(ways=3))
+    hypotheses.likeliest(0, (), three, lambda *_: None)
     assert len(method.ramps) == looked
     assert [surface.doubt for surface in method.found] == [0.0, 2.0, 2.0][: len(method.found)]
     assert len(method.found) == 1 + 2 * looked
@@ -218,9 +228,10 @@ def test_samples_are_drawn_again_once_and_only_where_those_before_do_not_settle_
     monkeypatch, method
 ):
     method.misfit = {0: 0.5, 1: 0.4, 2: -0.5}
-    three = ((0, np.inf), (1, np.inf), (1, 1.0), (2, np.inf), (3, np.inf))
-    monkeypatch.setattr(hypotheses, "WAYS", three)
-    best = hypotheses.likeliest(0, (), Config(), lambda *_: None)
+    order = ((0, np.inf), (1, np.inf), (1, 1.0), (2, np.inf), (3, np.inf))
+    monkeypatch.setattr(ways, "WAYS", order)
+    five = replace(Config(), rotation=RotationConfig(ways=5))
+    best = hypotheses.likeliest(0, (), five, lambda *_: None)
     assert method.drawn == [1, 2]
     assert [surface.draw for surface in method.found] == [0, 1, 1, 2]
     assert best.found.fit.misfit == -0.5
@@ -232,12 +243,12 @@ def test_what_is_drawn_again_is_denser_and_flattened_further_as_such(method):
     first = RotationConfig()
     denser = replace(
         first,
-        spacing_m=hypotheses.FINER * first.spacing_m,
-        link_m=hypotheses.FINER * first.link_m,
+        spacing_m=ways.FINER * first.spacing_m,
+        link_m=ways.FINER * first.link_m,
     )
     assert best.found.fit.misfit == -0.5
     assert method.configs == [first, denser]
-    least = hypotheses.finer(RotationConfig(spacing_m=0.001, link_m=0.0021))
+    least = ways.finer(RotationConfig(spacing_m=0.001, link_m=0.0021))
     assert (least.spacing_m, least.link_m) == (0.001, 0.002)
 
 
@@ -246,9 +257,138 @@ def test_no_more_ways_are_tried_than_asked(method):
     hypotheses.likeliest(0, (), few, lambda *_: None)
     assert len(method.found) == 3
     hypotheses.likeliest(0, (), Config(), lambda *_: None)
-    assert len(method.found) == 3 + len(hypotheses.WAYS)
+    assert len(method.found) == 3 + len(ways.WAYS)
 
 
 def test_all_ways_can_be_asked_for():
-    (ways,) = (f for f in dataclasses.fields(RotationConfig) if f.name == "ways")
-    assert ways.metadata["high"] == ways.default == len(hypotheses.WAYS)
+    (option,) = (f for f in dataclasses.fields(RotationConfig) if f.name == "ways")
+    assert option.metadata["high"] == option.default == len(ways.WAYS)
+
+
+@dataclass
+class Beside:
+    """A helper that is through with a way whenever it was asked some times; or gone after some."""
+
+    misfits: dict[int, float]
+    lives: int = 99  # ways that it gets through
+    slow: int = 1  # questions for each
+    ready: bool = True
+    hears: bool = True  # what it is not to try
+    gives: bool = True  # what it laid flat
+    fails: tuple[int, ...] = ()
+
+    def begin(self, task, order):
+        self.order, self.done, self.log, self.asked = list(order), {}, ["begin"], 0
+
+    def said(self):
+        self.asked += 1
+        if self.at() is not None and self.asked % self.slow == 0:
+            self.lives -= 1
+            way = self.order.pop(0)
+            failure = DisconnectedSurface(f"way {way}")
+            misfit = self.misfits.get(way, 0.5)
+            self.done[way] = failure if way in self.fails else tried(misfit=misfit).verdict
+        return self.done
+
+    def at(self):
+        return self.order[0] if self.ready and self.order and self.lives > 0 else None
+
+    def leave(self, way):
+        if self.hears and way in self.order:
+            self.order.remove(way)
+
+    def wait(self):
+        self.log.append("wait")
+        return "unfold", 0.5
+
+    def laid_flat(self, way):
+        self.log.append(way)
+        return tried(misfit=self.misfits.get(way, 0.5)) if self.gives else None
+
+    def end(self):
+        self.log.append("end")
+
+
+@pytest.fixture
+def numbered(monkeypatch):
+    """Ways that are good or bad as said by their numbers, and which were tried."""
+    noted = SimpleNamespace(misfits={}, fails=(), tried=[])
+
+    def verdict(_, way, progress):
+        noted.tried.append(way)
+        progress("unfold", 0.0)
+        if way in noted.fails:
+            return DisconnectedSurface(f"way {way}")
+        return tried(misfit=noted.misfits.get(way, 0.5)).verdict
+
+    def laid_flat(_, way, progress):
+        progress("unfold", 1.0)
+        return tried(misfit=noted.misfits.get(way, 0.5))
+
+    monkeypatch.setattr(hypotheses.Ways, "verdict", verdict)
+    monkeypatch.setattr(hypotheses.Ways, "laid_flat", laid_flat)
+    return noted
+
+
+def search(helper, progress=lambda *_: None):
+    return hypotheses.likeliest(0, (), Config(), progress, helper)
+
+
+@pytest.mark.parametrize("good", range(6))
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"lives": 0}, {"lives": 1}, {"lives": 3}, {"ready": False}, {"hears": False},
+     {"gives": False}],
+)  # fmt: skip
+def test_a_helper_changes_nothing_but_who_does_what(numbered, good, how):
+    """Way `good` settles it; ways after it are better, and would win if they counted."""
+    numbered.misfits = {way: -0.6 - 0.01 * way if way >= good else 0.5 for way in range(6)}
+    numbered.misfits[0] = -0.6 if good == 0 else 0.6
+    alone = search(None)
+    assert alone.found.fit.misfit == numbered.misfits[good]
+    assert numbered.tried == list(range(good + 1))
+    numbered.tried.clear()
+    beside = Beside(numbered.misfits, **how)
+    both = search(beside)
+    assert both.found.fit.misfit == alone.found.fit.misfit and both.rival == alone.rival
+    assert beside.log[-1] == "end"
+    assert len(set(numbered.tried)) == len(numbered.tried)
+    if not how and good > 2:
+        assert len(numbered.tried) < good + 1  # it did some
+
+
+def test_ways_that_lead_nowhere_count_for_nothing_whoever_tried_them(numbered):
+    numbered.misfits, numbered.fails = {4: -0.6}, (0, 1, 2, 3)
+    assert search(None).found.fit.misfit == -0.6
+    assert search(Beside(numbered.misfits, fails=(2, 3))).found.fit.misfit == -0.6
+    numbered.fails = range(6)
+    for helper in (None, Beside({}, fails=range(6))):
+        with pytest.raises(DisconnectedSurface, match="way 0"):
+            search(helper)
+
+
+def test_what_the_helper_settles_ends_the_way_that_is_being_tried(numbered, monkeypatch):
+    """The caller is at way 4, since the helper is at 3, which turns out to be good."""
+    misfits, ended = {3: -0.9}, []
+
+    def verdict(_, way, progress):
+        numbered.tried.append(way)
+        for _ in range(9):
+            progress("unfold", 0.0)
+        ended.append(way)
+        return tried(misfit=misfits.get(way, 0.5)).verdict
+
+    monkeypatch.setattr(hypotheses.Ways, "verdict", verdict)
+    assert search(Beside(misfits, slow=15)).found.fit.misfit == -0.9
+    assert numbered.tried == [0, 1, 4] and ended == [0, 1]
+
+
+def test_the_helper_is_stopped_when_the_caller_stops(numbered):
+    helper = Beside({}, lives=0)
+
+    def cancel(*_):
+        raise Cancelled("enough")
+
+    with pytest.raises(Cancelled):
+        search(helper, cancel)
+    assert helper.log == ["begin", "end"]

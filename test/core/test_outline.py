@@ -10,7 +10,7 @@ from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.distances import link_steps
 from vflatten_ros.core.fusion import Samples
 from vflatten_ros.core.geometry import twice_area
-from vflatten_ros.core.rotation import Surface, Unfolded, edges_laid, outline_of, together
+from vflatten_ros.core.rotation import Laid, Surface, edges_laid, outline_of, together
 from vflatten_ros.core.sheets import Links
 
 CONFIG = RotationConfig()
@@ -134,9 +134,8 @@ def test_a_group_that_lies_apart_from_the_rest_is_told(gap_m, told):
     groups = []
     for row in (np.arange(first), np.arange(first, n)):
         points, up = lying_at(places[row]), np.ones(len(row))
-        outline = outline_of(points.uv, points.sigma_m, edges[row], CONFIG)
         firm = np.ones(len(row), dtype=bool)
-        groups.append(Unfolded(surface, (), points, row, up, firm, outline, 0.0, 0.0, ()))
+        groups.append(Laid(surface, (), points, row, up, firm, 0.0, 0.0, ()))
     both = together(groups, (), [g.points for g in groups], [g.side for g in groups], CONFIG)
     assert [notice.code for notice in both.notices] == ["untrusted"] * told
     assert all("33 %" in notice.text for notice in both.notices)

@@ -40,11 +40,12 @@ def replayed(path):
 
 
 PROTOCOL = ["--protocol", str(RECORDING / "protocol.json")]
+ROTATION = ["--method", "rotation", "--processes", "1"]  # the node has two
 
 
 @pytest.mark.parametrize(
     "method, rate, options",
-    [("kita2019", 1.0, PROTOCOL), ("rotation", 4.0, ["--method", "rotation"])],
+    [("kita2019", 1.0, PROTOCOL), ("rotation", 4.0, ROTATION)],
     ids=["kita2019", "rotation"],
 )
 def test_the_planners_round_gives_what_replay_gives(ros, tmp_path, method, rate, options):

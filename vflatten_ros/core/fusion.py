@@ -38,6 +38,10 @@ class Points:
         """Of xyz."""
         return cKDTree(self.xyz, balanced_tree=False, compact_nodes=False)
 
+    def __reduce__(self) -> tuple[type[Points], tuple[Float, Float, Int]]:
+        """Another process makes its own tree."""
+        return Points, (self.xyz, self.normal, self.view)
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:

@@ -13,7 +13,7 @@ from vflatten_ros.core.category_outline import MOST_DEEP_M, deep_inside_m, with_
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.grain import suited
-from vflatten_ros.core.hypotheses import likeliest
+from vflatten_ros.core.hypotheses import Helper, likeliest
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.one_view import flatten_one_view
@@ -70,6 +70,7 @@ def flatten_garment(
     progress: Progress = no_progress,
     prepared: Mapping[int, ViewSurface] | None = None,
     so_far: Folded | None = None,
+    helper: Helper | None = None,
 ) -> FlatGarment:
     """Lay a hanging item flat: its outline, category, sizes and named places.
 
@@ -89,6 +90,8 @@ def flatten_garment(
         Results of prepare_view by view_id, with the same config.
     so_far : Folded, optional
         Result of fold_in for them, made as the views arrived. 'kita2019' does not use it.
+    helper : Helper, optional
+        Another process that shares the work of 'rotation'; the result is the same without.
 
     Raises
     ------
@@ -100,7 +103,7 @@ def flatten_garment(
     done = prepared or {}
     if config.method == "rotation":
         flattened, settled = _rotation(
-            views, correspondences, templates, config, progress, done, so_far
+            views, correspondences, templates, config, progress, done, so_far, helper
         )
     else:
         flattened, settled = _kita2019(views, correspondences, templates, config, progress, done)
@@ -141,6 +144,7 @@ def _rotation(
     progress: Progress,
     prepared: Mapping[int, ViewSurface],
     so_far: Folded | None,
+    helper: Helper | None,
 ) -> tuple[Flattened, Recognition | None]:
     """The automatic method: all views of a rotation."""
     fused = fuse_views(
@@ -155,7 +159,7 @@ def _rotation(
     )
     config = replace(config, rotation=suited(config.rotation, fused.grain))
     given, told = fused.given, fused.notices + fused.given.notices
-    best = likeliest(fused, tuple(templates), config, progress)
+    best = likeliest(fused, tuple(templates), config, progress, helper)
     config = replace(config, rotation=best.rotation)
     del fused  # its points are many
     unfolded, found = best.unfolded, best.found

@@ -112,8 +112,9 @@ def camera_rays(points: Float, pixel: NDArray[np.int32], shape: tuple[int, int])
     fit, *_ = np.linalg.lstsq(ones, rc, rcond=None)
     if np.abs(ones @ fit - rc).max() < 0.02:
         to_place = np.linalg.pinv(fit[:3].T)  # columns e_row, e_col, square to the rays
+        e_row, e_col = to_place.T.copy()
         origin = -to_place @ fit[3]
-        return parallel_rays(origin, to_place[:, 0], to_place[:, 1], shape)
+        return parallel_rays(origin, e_row, e_col, shape)
     middle, size = sample.mean(axis=0), sample.std()
     p = np.concatenate([(sample - middle) / size, np.ones((len(sample), 1))], axis=1)
     x = (rc - rc.mean(axis=0)) / scale
@@ -139,14 +140,8 @@ def camera_rays(points: Float, pixel: NDArray[np.int32], shape: tuple[int, int])
     if np.abs(seen[:, :2] / seen[:, 2:] - rc).max() > 0.05:
         return None
     inverse = np.linalg.inv(matrix[:, :3])
+    ray_row, ray_col, ray0 = inverse.T.copy()  # no views, which add up otherwise than their copies
     zero = np.zeros(3)
     return RayGrid(
-        -inverse @ matrix[:, 3],
-        zero,
-        zero,
-        inverse[:, 2],
-        inverse[:, 0],
-        inverse[:, 1],
-        matrix,
-        shape,
-    )
+        -inverse @ matrix[:, 3], zero, zero, ray0, ray_row, ray_col, matrix, shape
+    )  # fmt: skip

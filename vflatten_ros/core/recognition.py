@@ -154,7 +154,7 @@ def recognise_again(
 def _fitted_from(before: Fit, template: Template, evidence: Evidence) -> Fit:
     """A category fitted from where another of the same build, or itself, was."""
     state = before.state
-    if template is not before.template:
+    if template.category != before.template.category:
         state = template.state_of(before.template, state)
     pose = np.stack([before.pose, before.pose])
     states = np.stack([state, template.at_rest(state)])

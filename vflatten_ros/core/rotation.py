@@ -6,7 +6,7 @@ Like the pipeline, this module knows the order of its stages, which do not know 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -83,7 +83,7 @@ class Fused:
 
     samples: Samples
     points: Points  # that the samples were fitted to
-    point_view_id: Int  # (m,)
+    view_ids: Int  # (v,) of the points' views
     point_pixel: Int  # (m, 2)
     grain: Grain  # of the points, median of the views
     sights: tuple[PlacedSight, ...] = ()  # none: whether cloth goes on is told by the samples
@@ -93,7 +93,8 @@ class Fused:
     @property
     def view_id(self) -> Int:
         """(n,) of the measured point nearest to each sample."""
-        return self.point_view_id[self.samples.source]
+        view: Int = self.points.view[self.samples.source]
+        return self.view_ids[view]
 
     @property
     def pixel(self) -> Int:
@@ -123,7 +124,7 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class Unfolded:
+class Laid:
     """The visible surface or a part of it, flattened."""
 
     surface: Surface
@@ -132,7 +133,6 @@ class Unfolded:
     row: Int  # (n,) of the samples
     side: Float  # (n,) 1 outside up, -1 outside down, 0 unclear
     firm: Bool  # (n,) placed by distances along the sheet
-    outline: Outline
     stress_m: float  # rms excess over the distances
     overlap: float  # 0-1, share of the surface that lies on more of the same side
     notices: tuple[Notice, ...]
@@ -141,6 +141,13 @@ class Unfolded:
     def share(self) -> float:
         """Share of all samples that were flattened."""
         return sum(float(part.distances.inside.mean()) for part in self.parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Unfolded(Laid):
+    """The same with its outline."""
+
+    outline: Outline
 
 
 def unfold_surface(
@@ -163,7 +170,7 @@ def unfold_surface(
 
 
 def together(
-    groups: Sequence[Unfolded],
+    groups: Sequence[Laid],
     parts: tuple[Part, ...],
     points: Sequence[FlatPoints],
     sides: Sequence[Float],
@@ -174,7 +181,7 @@ def together(
 
     Parameters
     ----------
-    groups : sequence of Unfolded
+    groups : sequence of Laid
     parts : tuple of Part
         Theirs, in one plane.
     points : sequence of FlatPoints
@@ -218,10 +225,10 @@ def together(
         row,
         side,
         firm,
-        outline,
         stress,
         folded,
         tuple(notices.values()),
+        outline,
     )
 
 
@@ -262,9 +269,9 @@ def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationCo
     for part in unfolded.parts:
         plane = carry(part.plane, swung, rest)
         plane = settle(plane, part.distances.bound_m, part.distances.same_sheet, config)
-        parts.append(unfolded_from(unfolded.surface, Part(part.distances, plane), config))
+        parts.append(_laid_from(unfolded.surface, Part(part.distances, plane), config))
     if len(parts) == 1:
-        return parts[0]
+        return _outlined(parts[0], config)
     turned, at = [], 0
     for one in parts:  # as uncertain as they were
         was = slice(at, at + len(one.row))
@@ -337,9 +344,9 @@ def fuse_views(
     points = Points(
         xyz=np.vstack([transform_points(pose, s.points) for pose, s in placed_points]),
         normal=np.vstack([transform_directions(pose, s.normals) for pose, s in placed_normals]),
-        view=np.repeat(np.arange(len(surfaces)), count),
+        view=np.repeat(np.arange(len(surfaces), dtype=np.int32), count),
     )
-    point_view_id = np.repeat(np.array([view.view_id for view in views], dtype=np.int64), count)
+    view_ids = np.array([view.view_id for view in views], dtype=np.int64)
     point_pixel = np.vstack([v.pixel[s.index] for v, s in zip(views, surfaces, strict=True)])
     samples = fuse(points, config, progress)
     slid = None
@@ -354,7 +361,7 @@ def fuse_views(
         for surface, pose in zip(surfaces, poses, strict=True)
         if surface.sight is not None
     )
-    return Fused(samples, points, point_view_id, point_pixel, grain, sights, checked, notices)
+    return Fused(samples, points, view_ids, point_pixel, grain, sights, checked, notices)
 
 
 def drawn_again(fused: Fused, draw: int, config: RotationConfig, progress: Progress) -> Fused:
@@ -446,6 +453,11 @@ def edges_laid(surface: Surface, row: Int, uv: Float) -> Int:
 
 
 def unfolded_from(surface: Surface, part: Part, config: RotationConfig) -> Unfolded:
+    """All samples of a part whose landmarks were flattened, and their outline."""
+    return _outlined(_laid_from(surface, part, config), config)
+
+
+def _laid_from(surface: Surface, part: Part, config: RotationConfig) -> Laid:
     samples, links, distances = surface.samples, surface.links, part.distances
     uv, misfit = place_samples(
         distances.around, distances.around_m, distances.around_sheet, part.plane
@@ -474,19 +486,12 @@ def unfolded_from(surface: Surface, part: Part, config: RotationConfig) -> Unfol
     firm = (distances.around_sheet.sum(1) >= FIRM)[placed]
     firm |= firm.mean() < FIRM_SHARE  # too few would leave holes
     row, side = np.flatnonzero(placed), side[placed]
-    outline = _outline(surface, row, points, side, firm, config)
-    return Unfolded(
-        surface,
-        (part,),
-        points,
-        row,
-        side,
-        firm,
-        outline,
-        stress,
-        folded,
-        tuple(notices),
-    )
+    return Laid(surface, (part,), points, row, side, firm, stress, folded, tuple(notices))
+
+
+def _outlined(laid: Laid, config: RotationConfig) -> Unfolded:
+    outline = _outline(laid.surface, laid.row, laid.points, laid.side, laid.firm, config)
+    return Unfolded(**{f.name: getattr(laid, f.name) for f in fields(laid)}, outline=outline)
 
 
 def _outline(
@@ -555,7 +560,7 @@ def outline_of(
     longest = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
     contour = low + CELL_M * thinned_loop(longest)
     if twice_area(contour) < 0:
-        contour = contour[::-1]
+        contour = contour[::-1].copy()  # a view adds up otherwise: a process gets a copy
     near = cKDTree(uv).query(contour)[1]
     inferred = _near(contour, uv[edge == 2]) > HIDDEN_SHARE * _near(contour, uv[edge > 0])
     inferred &= ~_before_an_end(contour, inferred)

@@ -1,0 +1,166 @@
+"""How good one way of laying the surface flat is, and which of several to believe."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from vflatten_ros.core.category_outline import MOST_DEEP_M, deep_inside_m
+from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.doubled import MISLAID, doubled_share
+from vflatten_ros.core.recognition import UNKNOWN, Recognition
+from vflatten_ros.core.rotation import Unfolded
+
+DISPUTED = -0.5  # badness below which a way that is unsure, or has rivals, settles it
+PLACED = -0.35  # the same for groups that nothing joins but the category
+YIELDING = 0.15  # by which the third way and each further one raise these two
+RIVAL = 1.5  # how much worse ways to other categories may be
+MAJORITY = 2  # ways of the best one's category for each such, for them not to count
+UNDECIDED = 0.9  # probability of the best way's category below which it is unsure
+VOTE = 2.0  # by how many e-folds a way counts less if it is worse by 1
+NEAR_TIE = 0.67  # share of the best category's votes, for the result not to be trusted
+SURE = 0.97  # probability of a category below which one way alone is not believed
+MOST_UNSEEN = 0.15  # share of the outline that no view shows, above which it is not, either
+DOUBTFUL = 0.3  # badness above which a result is not to be trusted, and more ways are tried
+UNSURE = 0.7  # probability of its category below which it is not, either
+STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
+LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
+MOSTLY_DOUBLED = 0.1  # share of a single sheet on other cloth of its own that counts as 1
+STRAINED_M = 0.001  # misfit of the distances at a point that cloth laid flat seldom has
+STRAIN, MOSTLY_STRAINED = 0.06, 0.1  # share of points with more; more that counts as 1
+EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
+ODD = 0.5  # for a long stretch of the outline deep inside the category's
+ASIDE = 3.0  # of the share that is left out in large groups, beside: it can be no noise
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is said of a way when it is weighed against others."""
+
+    category: str
+    badness: float
+    sure: float  # probability of the likeliest category
+    parts: int  # groups that only the category joins, or 1
+    unseen: float  # share of the outline that no view shows
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """One way to lay the item flat, and what it is then."""
+
+    unfolded: Unfolded
+    found: Recognition
+    aside: float = 0.0  # share of the samples in large groups that were left out
+    rival: str = ""  # another category for which other ways speak nearly as much
+    rotation: RotationConfig = RotationConfig()  # by which it was laid flat
+
+    @cached_property
+    def deep_m(self) -> float:
+        """Longest stretch of the outline that was seen deep inside the category's, m."""
+        if self.found.fit is None:
+            return 0.0
+        return deep_inside_m(self.unfolded.outline, self.found.fit)
+
+    @cached_property
+    def doubled(self) -> float:
+        """Share of a single sheet that lies on other cloth of its own; 0 for any other item."""
+        if self.found.fit is None or not self.found.fit.template.single_sheet:
+            return 0.0
+        return doubled_share(self.unfolded.points)
+
+    @property
+    def badness(self) -> float:
+        """How badly and unsurely a category fits, how far from flat it lies, what is left out.
+
+        A garment laid flat has one layer of either side everywhere, and distances that agree; where
+        there are more layers, or the distances contradict each other over some area, layers were
+        joined that are not. A piece alone may look like a whole item of another kind.
+        """
+        misfit = self.found.fit.misfit if self.found.fit is not None else np.inf
+        folded = max(0.0, self.unfolded.overlap - LAID) / MOSTLY_LAID
+        strain = float((self.unfolded.points.stress > STRAINED_M).mean())
+        folded += max(0.0, strain - STRAIN) / MOSTLY_STRAINED
+        folded += max(0.0, self.doubled - MISLAID) / MOSTLY_DOUBLED
+        left_out = max(0.0, 1.0 - self.unfolded.share - STRAYS) / MOSTLY_LEFT
+        explained = self.found.fit.explained if self.found.fit is not None else 0.0
+        odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD
+        if self.deep_m > MOST_DEEP_M:
+            odd += ODD
+        left_out += ASIDE * self.aside
+        unknown = float(self.found.category == UNKNOWN)
+        return float(misfit + folded + left_out + odd + 1.0 - self.sure + unknown)
+
+    @property
+    def sure(self) -> float:
+        """Probability of the likeliest category."""
+        known = [p for name, p in self.found.probabilities.items() if name != UNKNOWN]
+        return max(known, default=0.0)
+
+    @property
+    def verdict(self) -> Verdict:
+        return Verdict(
+            category=self.found.category,
+            badness=self.badness,
+            sure=self.sure,
+            parts=len(self.unfolded.parts),
+            unseen=float(self.unfolded.outline.inferred.mean()),
+        )
+
+    @property
+    def untrusted(self) -> str:
+        """Why the result is not to be trusted; empty: it may be."""
+        if self.badness > DOUBTFUL:
+            return f"no category fits the item well, or it does not lie flat ({self.badness:.1f})"
+        if self.sure < UNSURE:
+            return f"it is only {self.sure:.0%} likely to be what it most looks like"
+        if self.rival:
+            return f"laid flat in other ways it is nearly as good a {self.rival}"
+        return ""
+
+
+def settled(tries: Sequence[Verdict]) -> bool:
+    """Whether what was tried is good enough, undisputed, and one way alone beyond doubt."""
+    if not tries:
+        return False
+    best = best_of(tries)
+    known = [one for one in tries if one.category != UNKNOWN]
+    near = [one for one in known if one.badness < best.badness + RIVAL]
+    against = sum(one.category != best.category for one in near)
+    agreed = len(near) - against >= MAJORITY * against
+    limit = DOUBTFUL
+    if not agreed or best.sure < UNDECIDED:
+        limit = DISPUTED + YIELDING * max(0, len(tries) - 2)
+    elif best.parts > 1:
+        limit = PLACED + YIELDING * max(0, len(tries) - 2)
+    if best.badness >= limit:
+        return False
+    return len(tries) > 1 or (best.sure >= SURE and best.unseen < MOST_UNSEEN)
+
+
+def rival(tries: Sequence[Verdict]) -> str:
+    """Another category that has nearly as many votes as the best way's; or none."""
+    votes = _votes(tries)
+    mine = votes.pop(best_of(tries).category)
+    votes.pop(UNKNOWN, None)
+    other = max(votes, key=lambda name: votes[name], default="")
+    return other if other and votes[other] > NEAR_TIE * mine else ""
+
+
+def _votes(tries: Sequence[Verdict]) -> dict[str, float]:
+    """How much speaks for each category: the better a way to it, and the more ways, the more."""
+    least = min(one.badness for one in tries)
+    votes: dict[str, float] = {}
+    for one in tries:
+        vote = 1.0 if one.badness == least else float(np.exp(VOTE * (least - one.badness)))
+        votes[one.category] = votes.get(one.category, 0.0) + vote
+    return votes
+
+
+def best_of(tries: Sequence[Verdict]) -> Verdict:
+    """The best way, to the category with most votes."""
+    votes = _votes(tries)
+    category = max(votes, key=lambda name: votes[name])
+    return min((t for t in tries if t.category == category), key=lambda t: t.badness)

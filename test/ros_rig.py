@@ -18,6 +18,7 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from running import children_of
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from vflatten_ros.action import Flatten
@@ -105,12 +106,12 @@ class Process:
 
     def children(self):
         """Processes that it has started."""
-        text = Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text()
-        return [
-            int(child)
-            for child in text.split()
-            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
-        ]
+        return children_of(self.pid, b"spawn_main")
+
+    def helpers(self):
+        """Processes that its flattening process has started."""
+        (worker,) = self.children()
+        return children_of(worker, b"vflatten_ros.helper")
 
 
 class Rig:

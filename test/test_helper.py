@@ -7,12 +7,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from recordings import BAGS
+from running import cpu_s, gone
 
 from vflatten_ros import helper as helping
 from vflatten_ros.bag import gather_views, open_recording
@@ -73,25 +72,6 @@ def helper():
     with HelperProcess() as process:
         assert process.wait_until_ready(READY_S)
         yield process
-
-
-def cpu_s(pid):
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def gone(pid, within_s=20.0):
-    """Whether a process that is not our child ends."""
-    end = time.monotonic() + within_s
-    while time.monotonic() < end:
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except FileNotFoundError:
-            return True
-        if state == "Z":
-            return True
-        time.sleep(0.05)
-    return False
 
 
 def test_two_processes_give_what_one_gives_to_the_bit(item, helper, monkeypatch):

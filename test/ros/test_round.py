@@ -9,6 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from rclpy.serialization import deserialize_message
 from ros_rig import CALIBRATION, REAL, RECORDING, ROOT, Process, Rig
+from running import cpu_s, gone
 from vflatten_ros.msg import FlattenedView, GarmentEstimate
 
 from vflatten_ros import messages
@@ -51,6 +52,7 @@ ROTATION = ["--method", "rotation", "--processes", "1"]  # the node has two
 def test_the_planners_round_gives_what_replay_gives(ros, tmp_path, method, rate, options):
     """The recording is played, once at its own rate; meanwhile it is replayed without ROS."""
     arguments = ["--calibration", str(CALIBRATION), "--ros-args", "-p", "worker_nice:=0"]
+    arguments += ["-p", f"worker_processes:={1 if method == 'kita2019' else 2}"]
     rig = Rig(tmp_path, kind=REAL, arguments=[*arguments, "-p", "auto_flatten:=false"])
     try:
         planner = Process(
@@ -67,7 +69,12 @@ def test_the_planners_round_gives_what_replay_gives(ros, tmp_path, method, rate,
             [*command, *options, "--mcap", str(tmp_path / "replay.mcap")], check=True, cwd=ROOT
         )
         assert planner.wait(180) == 0, planner.log() + rig.node.log()
+        helpers = rig.node.helpers()
+        assert len(helpers) == (method == "rotation")
+        assert all(cpu_s(helper) > 2.0 for helper in helpers)  # loading takes less than one
         assert rig.node.stop() == 0
+        assert all(gone(helper) for helper in helpers)
+        assert "helper" not in rig.node.log()  # it had no trouble
     finally:
         rig.close()
 

@@ -383,6 +383,14 @@ def test_what_the_helper_settles_ends_the_way_that_is_being_tried(numbered, monk
     assert numbered.tried == [0, 1, 4] and ended == [0, 1]
 
 
+def test_what_the_caller_tries_is_left_to_it(numbered):
+    """While the helper is at a way, the caller goes on to the next: six ways, each tried once."""
+    helper = Beside({}, slow=3)
+    search(helper)
+    assert sorted([*numbered.tried, *helper.done]) == list(range(6))
+    assert numbered.tried == [0, 1, 4]
+
+
 def test_the_helper_is_stopped_when_the_caller_stops(numbered):
     helper = Beside({}, lives=0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -104,6 +105,19 @@ def test_sizes_tell_shorts_from_trousers_once_the_legs_lie_right():
         assert again.fit is again.fits[then]
         inseam = again.fit.template.size_values(again.fit.state)[2]
         assert inseam == pytest.approx(length_m, rel=0.05)
+
+
+def test_what_another_process_recognised_is_recognised_again_to_the_same_bits():
+    """Its templates are copies of ours."""
+    config, item = RecognitionConfig(), two_legs(0.24)
+    before = recognise(*two_legs(0.32), TEMPLATES, config)
+    here = recognise_again(before, *item, TEMPLATES, config)
+    there = recognise_again(deepcopy(before), *item, TEMPLATES, config)
+    assert before.category in ("shorts", "trousers")  # with parts: fitted from where they were
+    for name, fit in here.fits.items():
+        assert there.fits[name].state.tobytes() == fit.state.tobytes()
+        assert there.fits[name].pose.tobytes() == fit.pose.tobytes()
+    assert there.probabilities == here.probabilities
 
 
 def test_what_was_taken_for_an_item_without_parts_is_recognised_anew():

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -123,7 +124,7 @@ def odd_layouts(a, b, path=""):
 def test_if_it_is_killed_the_result_is_the_same_and_there_is_another_next_time(
     item, helper, capfd, when
 ):
-    pid = helper.pid
+    pid, threads = helper.pid, threading.active_count()
 
     def kill(stage, fraction):
         now = stage == "link" if when == "as it begins" else helper.said()
@@ -135,6 +136,7 @@ def test_if_it_is_killed_the_result_is_the_same_and_there_is_another_next_time(
     assert alike(item.flattened(helper), item.alone) == []
     assert helper.wait_until_ready(READY_S) and helper.pid != pid
     assert "helper process ended (-9), starting another" in capfd.readouterr().err
+    assert threading.active_count() == threads
     assert alike(item.flattened(helper), item.alone) == []
 
 

@@ -117,6 +117,15 @@ def test_a_leg_that_hangs_by_hidden_cloth_is_put_in_its_place(monkeypatch):
     category, off = errors(placed, folder)
     assert placed.category == category and max(off) < 0.04
     assert point_error_m(placed, folder) < 0.01
+    # which of its seams is the inner one nothing tells, and its landmarks say so
+    told = [{notice.code for notice in garment.notices} for garment in (placed, whole)]
+    assert ["turned_over" in codes for codes in told] == [True, False]
+    off = {
+        garment: {m.name: m.xyz_sigma_m for m in garment.landmarks if "_hem_" in m.name and m.seen}
+        for garment in (placed, whole)
+    }
+    assert sum(sigma_m > 0.03 for sigma_m in off[placed].values()) >= 2
+    assert sum(sigma_m > 0.03 for sigma_m in off[whole].values()) == 0
     # a leg as it was placed is less certain than one that hangs on the rest
     for name in ("width", "length"):
         assert placed.measurement(name).sigma_m > whole.measurement(name).sigma_m

@@ -182,20 +182,16 @@ class HelperProcess:
         process: subprocess.Popen[bytes],
         outbox: queue.SimpleQueue[_Message | None],
     ) -> None:
-        while True:
-            try:
+        with suppress(EOFError, OSError):
+            while process is self._process:
                 kind, number, *content = _received(pipe)
-            except (EOFError, OSError):
-                break
-            with self._changed:
-                if process is not self._process:
-                    return
-                self._heard = time.monotonic()
-                if kind == "ready":
-                    self._ready, self._stillborn = True, 0
-                elif number == self._number:
-                    self._take(kind, content)
-                self._changed.notify_all()
+                with self._changed:
+                    self._heard = time.monotonic()
+                    if kind == "ready":
+                        self._ready, self._stillborn = True, 0
+                    elif number == self._number:
+                        self._take(kind, content)
+                    self._changed.notify_all()
         with self._changed:
             if process is self._process:
                 self._stillborn += not self._ready

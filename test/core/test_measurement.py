@@ -120,6 +120,27 @@ def test_few_views_make_sizes_and_places_less_certain_than_many():
     assert ratio == pytest.approx(np.full(len(ratio), 3.0), rel=0.01)
 
 
+def test_a_landmark_on_a_part_that_may_lie_turned_over_hangs_there_or_there():
+    outline, points = rectangle(top_seen=True), cloth(2)
+    upper = points.uv[:, 1] > LENGTH_M / 2
+    either = dataclasses.replace(points, astray_m=np.where(upper, 0.12, 0.0))
+    found = recognise(outline, points, TOWEL, RecognitionConfig())
+    before, after = (
+        {mark.name: mark for mark in measure(found, outline, p, MeasurementConfig()).landmarks}
+        for p in (points, either)
+    )
+    on_it = {name for name, mark in before.items() if mark.uv[1] > 0.9 * LENGTH_M}
+    assert len(on_it) == 2
+    for name, mark in after.items():
+        there = mark.xyz_hanger, mark.views
+        assert there == (before[name].xyz_hanger, before[name].views)
+        if name in on_it:
+            assert mark.xyz_sigma_m == pytest.approx(0.06, abs=0.01)  # half of it either way
+            assert mark.certainty < 0.4 * before[name].certainty
+        elif name != "centre":
+            assert mark == before[name]
+
+
 def test_the_corners_of_a_rectangle_may_be_named_the_other_way_round():
     result, _ = measured()
     certainty = {mark.name: mark.certainty for mark in result.landmarks}
@@ -139,9 +160,8 @@ def test_the_ends_of_a_skirt_that_flares_are_told_apart():
     points = cloth(24)
     inside = np.abs(points.uv[:, 0] - 0.25) < 0.25 - 0.25 * points.uv[:, 1]
     inside &= points.uv[:, 1] < 0.4
-    some = FlatPoints(
-        **{f.name: getattr(points, f.name)[inside] for f in dataclasses.fields(FlatPoints)}
-    )
+    arrays = {f.name: getattr(points, f.name) for f in dataclasses.fields(FlatPoints)}
+    some = FlatPoints(**{name: a[inside] for name, a in arrays.items() if a is not None})
     skirt = tuple(t for t in load_templates() if t.category == "skirt")
     found = recognise(outline, some, skirt, RecognitionConfig())
     result = measure(found, outline, some, MeasurementConfig())

@@ -11,7 +11,7 @@ import pytest
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core import placing
 from vflatten_ros.core.config import Config
-from vflatten_ros.core.placing import Group, place_groups
+from vflatten_ros.core.placing import Group, place_groups, turned_over
 from vflatten_ros.core.puzzle import Motion
 from vflatten_ros.core.values import FlatPoints, Outline
 
@@ -149,6 +149,26 @@ def test_a_part_of_a_leg_lies_about_as_far_down_as_it_hangs():
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
+def test_a_leg_may_lie_turned_over_unless_where_it_hangs_tells(mirrored):
+    *_, first, second = parted(Motion(mirrored, np.exp(1.9j), 0.8 - 0.4j))
+    best = place_groups([first, second], load_templates(), Config())[0]
+    assert turned_over(best, [first, second], Config()) == [None, None]  # it hangs as it lies
+    narrow = [1.0 / 3.0, 1.0, 1.0]  # gathered: either seam hangs near everything
+    groups = [
+        replace(g, points=replace(g.points, xyz_hanger=g.points.xyz_hanger * narrow))
+        for g in (first, second)
+    ]
+    best = place_groups(groups, load_templates(), Config())[0]
+    stays, other = turned_over(best, groups, Config())
+    assert stays is None and other.mirrored != best.motions[1].mirrored
+    here, there = (m(second.points.uv @ np.array([1, 1j])) for m in (best.motions[1], other))
+    # in the same place, with the seams exchanged
+    assert abs(here.mean() - there.mean()) < 0.03
+    across = np.abs(here - there)
+    assert across.max() > 0.08 and np.quantile(across, 0.05) < 0.02
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("right", [False, True])
 def test_a_corner_of_a_hem_is_put_where_it_hangs_from(right, mirrored):
     """The left one is like the right one turned over, but for where it hangs."""
@@ -182,8 +202,9 @@ def test_a_corner_of_a_hem_is_put_where_it_hangs_from(right, mirrored):
     z = best.motions[1](second.points.uv @ np.array([1, 1j]))
     hangs = second.points.xyz_hanger @ np.array([1, 1j, 0])
     assert np.abs(z - hangs).max() < 0.06 and np.median(np.abs(z - hangs)) < 0.02
-    # and its front is not taken for its back
+    # and its front is not taken for its back, nor might it be
     assert best.motions[1].mirrored == (mirrored != right)
+    assert turned_over(best, [first, second], Config()) == [None, None]
 
 
 @pytest.mark.parametrize("leg_first", [False, True])

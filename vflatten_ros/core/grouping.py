@@ -167,6 +167,7 @@ def put_beside(
     item: Float,
     sigma_m: float,
     config: RotationConfig,
+    turned: Sequence[Motion | None] = (),
 ) -> Unfolded:
     """Several groups in one plane.
 
@@ -179,15 +180,31 @@ def put_beside(
         Outline of the item by which they were placed.
     sigma_m : float
         How far the places of all but the first may be off.
+    turned : sequence of Motion or None, optional
+        Result of turned_over for them.
     """
     parts, points, sides = [], [], []
+    others = turned or [None] * len(groups)
+    some = any(other is not None for other in others)
     for k, (group, motion) in enumerate(zip(groups, motions, strict=True)):
         moved = [Part(part.distances, _moved(part.plane, motion)) for part in group.parts]
         parts.extend(moved)
         sigma = np.hypot(group.points.sigma_m, sigma_m if k else 0.0)
-        points.append(replace(group.points, uv=_moved(group.points.uv, motion), sigma_m=sigma))
+        uv = _moved(group.points.uv, motion)
+        astray = _astray_m(group, uv, others[k]) if some else None
+        points.append(replace(group.points, uv=uv, sigma_m=sigma, astray_m=astray))
         sides.append(-group.side if motion.mirrored else group.side)
     return together(groups, tuple(parts), points, sides, config, item)
+
+
+def _astray_m(group: Unfolded, uv: Float, other: Motion | None) -> Float:
+    """(n,) distance, as they hang, to what would lie where the points of a group lie."""
+    points = group.points
+    if other is None:
+        return np.zeros(len(uv))
+    there = cKDTree(_moved(points.uv, other)).query(uv)[1]
+    away: Float = np.linalg.norm(points.xyz_hanger - points.xyz_hanger[there], axis=1)
+    return away
 
 
 def _moved(uv: Float, motion: Motion) -> Float:

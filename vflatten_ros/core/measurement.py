@@ -204,7 +204,8 @@ def _landmark(
     weight /= weight.sum()
     xyz = weight @ points.xyz_hanger[near]
     spread = np.sqrt(weight @ ((points.xyz_hanger[near] - xyz) ** 2).sum(axis=1))
-    xyz_sigma = float(np.sqrt(sigma**2 + spread**2 / 3.0 + distance.min() ** 2))
+    astray = 0.0 if points.astray_m is None else 0.5 * float(weight @ points.astray_m[near])
+    xyz_sigma = float(np.sqrt(sigma**2 + spread**2 / 3.0 + distance.min() ** 2 + astray**2))
     ids = points.view_id[near]
     views = sorted({int(v) for v in ids if v >= 0}, key=lambda v: (distance[ids == v].min(), v))
     certainty = probability * float(np.exp(-((xyz_sigma / 0.05) ** 2)))

@@ -187,6 +187,10 @@ def _rotation(
     )
     none = np.zeros(0)
     notices = told + unfolded.notices
+    if unfolded.points.astray_m is not None:
+        astray = float((unfolded.points.astray_m > 0.0).mean())
+        text = f"a part, {100 * astray:.0f} % of what was seen, fits as well turned over"
+        notices = (*notices, Notice("turned_over", text))
     reason = _odd(unfolded.outline, found) or best.untrusted
     if reason:
         notices = (*notices, Notice("untrusted", reason))

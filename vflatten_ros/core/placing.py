@@ -135,6 +135,7 @@ class _Places:
         return Motion(mirrored, turn, complex(u + 1j * v - turn * arm))
 
 
+AS_GOOD = 2.0  # by how much a group may fit worse turned over, halves of squared sigmas
 STAYS = Motion(False, 1.0, 0.0)
 
 
@@ -195,6 +196,49 @@ def place_groups(
     at_least = placed[0].cost + WORTH_PLACING
     others = [replace(p, energy=max(p.energy, at_least)) for p in found.values() if not p.motions]
     return placed + sorted(others, key=lambda placing: placing.cost)
+
+
+def turned_over(placing: Placing, groups: Sequence[Group], config: Config) -> list[Motion | None]:
+    """Where each group lies turned over about its place, if that is nearly as likely; else None.
+
+    A leg's two seams look alike, and nothing that was seen may join them to the rest.
+    """
+    shapes = [_shape(group) for group in groups]
+    outline, template = placing.outline, placing.template
+    ways = cloth_ways(outline, template.seam, template.single_sheet)
+    main_m = ways.to(shapes[0].inner[::THIN])
+    found: list[Motion | None] = [None]
+    for k in range(1, len(groups)):
+        others = [i for i in range(len(groups)) if i != k]
+        here = _images(
+            [shapes[i] for i in others],
+            [placing.motions[i] for i in others],
+            shapes[k],
+            outline=outline,
+            ways=ways,
+            main_m=main_m,
+        )
+        own = _places([placing.motions[k]], shapes[k])
+        other = _searched(
+            here, shapes[k], _places(_flipped(own, shapes[k]), shapes[k]), config.assembly
+        )
+        costs = [_costs(here, shapes[k], p, config.assembly)[:, 0].sum() for p in (own, other)]
+        found.append(other.motion(0, shapes[k]) if costs[1] < costs[0] + AS_GOOD else None)
+    return found
+
+
+def _flipped(place_: _Places, shape: _Shape) -> list[Motion]:
+    """A place of a group turned over about its long and its short axis."""
+    motion = place_.motion(0, shape)
+    z = motion(shape.inner)
+    middle = complex(z.mean())
+    axes = np.linalg.eigh(np.cov(z.real, z.imag))[1].T @ [1, 1j]
+    flips = []
+    for twice in axes**2:  # a reflection: z -> middle + twice * conj(z - middle)
+        turn = complex(twice * np.conj(motion.turn))
+        shift = complex(middle + twice * np.conj(motion.shift - middle))
+        flips.append(Motion(not motion.mirrored, turn, shift))
+    return flips
 
 
 def _first_fits(

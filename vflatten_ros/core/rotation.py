@@ -198,6 +198,7 @@ def together(
     for j in range(1, len(groups)):
         here, up = np.concatenate(z[:j]), np.concatenate(sides[:j])
         folded += lying_on(here, up, z[j], sides[j]) * count[j] / count.sum()
+    astray = [p.astray_m for p in points if p.astray_m is not None]
     all_points = FlatPoints(
         uv=np.vstack([p.uv for p in points]),
         xyz_hanger=np.vstack([p.xyz_hanger for p in points]),
@@ -206,6 +207,7 @@ def together(
         sigma_m=np.concatenate([p.sigma_m for p in points]),
         stress=np.concatenate([p.stress for p in points]),
         inferred=np.concatenate([p.inferred for p in points]),
+        astray_m=np.concatenate(astray) if astray else None,
     )
     row = np.concatenate([g.row for g in groups])
     firm = np.concatenate([g.firm for g in groups])
@@ -276,7 +278,8 @@ def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationCo
     for one in parts:  # as uncertain as they were
         was = slice(at, at + len(one.row))
         sigma = np.maximum(one.points.sigma_m, unfolded.points.sigma_m[was])
-        turned.append(replace(one.points, sigma_m=sigma))
+        astray = None if unfolded.points.astray_m is None else unfolded.points.astray_m[was]
+        turned.append(replace(one.points, sigma_m=sigma, astray_m=astray))
         at += len(one.row)
     planes = tuple(part for one in parts for part in one.parts)
     return together(parts, planes, turned, [one.side for one in parts], config, rest)

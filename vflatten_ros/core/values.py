@@ -150,6 +150,7 @@ class FlatPoints:
     sigma_m: Float  # (n,) one standard deviation of uv per axis
     stress: Float  # (n,) rms misfit of the distances at the point, metres
     inferred: Bool  # (n,) True: placed by the category's template, not seen
+    astray_m: Float | None = None  # (n,) how far off what is there may hang: see `turned_over`
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,6 +283,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "category_uncertain": "two categories fit nearly as well",
     "ends_alike": "turned by half a turn the item looks the same: its ends' names may be exchanged",
     "solution_uncertain": "the item may lie otherwise, with another width or length",
+    "turned_over": "a part may lie turned over: what is on it may be mistaken for its opposite",
     "correspondence_rejected": "a corresponding point contradicts the others",
     "coarse_points": "the points are noisier, or farther apart, than the method is set for",
     "views_misplaced": "a print on the cloth contradicts the registration of the views",

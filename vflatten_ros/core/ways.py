@@ -14,7 +14,7 @@ import numpy as np
 from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold_group
-from vflatten_ros.core.placing import Group, place_groups
+from vflatten_ros.core.placing import Group, place_groups, turned_over
 from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
 from vflatten_ros.core.rotation import (
     Fused,
@@ -156,7 +156,10 @@ class _Draw:
             if odds[placing.template.category] < LEAST_ODDS:
                 break
             sigma_m = config.assembly.sigma_m
-            beside = put_beside(laid, placing.motions, placing.outline, sigma_m, config.rotation)
+            turned = turned_over(placing, groups, config)
+            beside = put_beside(
+                laid, placing.motions, placing.outline, sigma_m, config.rotation, turned
+            )
             (only,) = (t for t in self._templates if t.category == placing.template.category)
             # all groups' ends say which way up it lies; where groups meet, the outline may not
             begin = {only.category: (placing.pose, only.state_of(placing.template, placing.state))}

@@ -162,6 +162,13 @@ def test_a_cancelled_task_is_left_and_the_next_one_done(item, helper):
     assert alike(item.flattened(helper), item.alone) == []
 
 
+@pytest.mark.parametrize(("processes", "cores"), [(1, 2), (2, 1)])
+def test_there_is_none_where_none_is_wanted_or_could_run(monkeypatch, processes, cores):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)))
+    monkeypatch.setattr(helping, "HelperProcess", lambda: pytest.fail("one was started"))
+    assert helping.helper_for(processes) is None
+
+
 def test_it_ends_with_its_caller():
     code = (
         "import time\nfrom vflatten_ros.helper import HelperProcess\n"

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from vflatten_ros import resources, threads
 from vflatten_ros.core.config import METHODS, Config
 from vflatten_ros.core.errors import VFlattenError
-from vflatten_ros.helper import HelperProcess
+from vflatten_ros.helper import helper_for
 from vflatten_ros.progress import Stages
 
 if TYPE_CHECKING:
@@ -135,9 +135,8 @@ def _replay(args: argparse.Namespace) -> None:
 
     _prepare_outputs(args)
     config = _config(args, "kita2019" if args.protocol else None)
-    alone = args.processes == 1 or config.method != "rotation"
-    helping = nullcontext() if alone else HelperProcess()
-    with helping as helper, Stages(_show_bar(args)) as stages:
+    helper = helper_for(args.processes) if config.method == "rotation" else None
+    with helper or nullcontext(), Stages(_show_bar(args)) as stages:
         replayed = replay_recording(
             args.recording,
             config,

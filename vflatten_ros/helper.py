@@ -219,6 +219,11 @@ class HelperProcess:
 _Message = list[bytes | memoryview]
 
 
+def helper_for(processes: int) -> HelperProcess | None:
+    """One, if two processes are wanted and there is more than one core for them."""
+    return HelperProcess() if processes > 1 and len(os.sched_getaffinity(0)) > 1 else None
+
+
 def _packed(*content: Any) -> _Message:
     """Arrays as they are, without a copy."""
     buffers: list[pickle.PickleBuffer] = []

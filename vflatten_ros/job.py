@@ -13,7 +13,7 @@ from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.values import FlatGarment, Progress, View
-from vflatten_ros.helper import HelperProcess
+from vflatten_ros.helper import helper_for
 from vflatten_ros.messages import fill, message_class
 from vflatten_ros.outputs import TYPES, result_messages
 from vflatten_ros.worker import Job
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 def load(categories: str, processes: int = 1) -> Flattening:
     """Ready for work with the categories of a folder ("": those of the package)."""
-    helper = HelperProcess() if processes > 1 else None  # it loads meanwhile
+    helper = helper_for(processes)  # it loads meanwhile
     # now, so that the first job need not wait for it
     from rclpy.serialization import serialize_message
 

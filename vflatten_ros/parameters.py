@@ -53,8 +53,8 @@ class NodeOptions(Checked):
     )
     worker_processes: int = option(
         2,
-        "Processes that flatten; with 2, one tries other ways of laying the item flat meanwhile "
-        "(method rotation). The result is the same.",
+        "Processes that flatten; with 2, and more than one core, one tries other ways of laying "
+        "the item flat meanwhile (method rotation). The result is the same.",
         low=1,
         high=2,
         read_only=True,

@@ -11,8 +11,9 @@ from recordings import BAGS
 
 from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core import parallel, pipeline, rotation, ways
+from vflatten_ros.core import grouping, parallel, pipeline, rotation, ways
 from vflatten_ros.core.config import Config
+from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.replay import replay_recording
 from vflatten_ros.results import garment_result, json_text
@@ -139,6 +140,24 @@ def test_views_that_tell_too_little_are_said_to(name, few):
     """Some ways find no piece that is large enough, or hangs together firmly enough."""
     garment = replay_recording(BAGS / name, ALL_VIEWS, view_ids=few).garment
     assert untrusted(garment) and not garment.enough
+
+
+def test_pieces_of_which_nothing_can_be_laid_flat_leave_the_other_ways(monkeypatch):
+    def nowhere(surface, links, piece, config, progress):
+        return np.full((len(piece), 2), np.nan)
+
+    monkeypatch.setattr(grouping, "laid_flat", nowhere)
+    said, verdict = [], ways.Ways.verdict
+
+    def noting(self, way, progress):
+        said.append(verdict(self, way, progress))
+        return said[-1]
+
+    monkeypatch.setattr(ways.Ways, "verdict", noting)
+    replay_recording(BAGS / "SK2_1", ALL_VIEWS, view_ids=range(0, 12, 2))
+    failed = [str(one) for one in said if isinstance(one, DisconnectedSurface)]
+    assert len(said) == 6 and len(failed) == 4
+    assert all("no piece of the surface has more than 1%" in text for text in failed)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from vflatten_ros.core.pipeline import flatten_garment, prepare_view
 from vflatten_ros.core.values import no_progress
 from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.helper import HelperProcess
+from vflatten_ros.processes import SETTINGS
 
 CONFIG, TEMPLATES = Config(), load_templates()
 READY_S = 60.0
@@ -167,6 +169,11 @@ def test_there_is_none_where_none_is_wanted_or_could_run(monkeypatch, processes,
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)))
     monkeypatch.setattr(helping, "HelperProcess", lambda: pytest.fail("one was started"))
     assert helping.helper_for(processes) is None
+
+
+def test_it_gives_memory_back(helper):
+    environment = Path(f"/proc/{helper.pid}/environ").read_bytes().split(b"\0")
+    assert {f"{name}={value}".encode() for name, value in SETTINGS.items()} <= set(environment)
 
 
 def test_it_ends_with_its_caller():

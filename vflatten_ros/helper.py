@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -320,9 +320,6 @@ def serve(handle: int) -> None:
 def _work(pipe: Connection, inbox: _Inbox, number: int, task: Task, ways: tuple[int, ...]) -> None:
     from vflatten_ros.core.ways import Ways
 
-    def left() -> Iterator[int]:
-        yield from (way for way in ways if way not in inbox.left)
-
     reported = 0.0
     finishing = False
 
@@ -338,7 +335,9 @@ def _work(pipe: Connection, inbox: _Inbox, number: int, task: Task, ways: tuple[
     trying = Ways(task)
     with suppress(_Interrupted):
         said: dict[int, Said] = {}
-        for way in left():
+        for way in ways:
+            if way in inbox.left:
+                continue
             _send(pipe, _packed("said", number, said, way))
             said = {way: trying.verdict(way, report)}
         _send(pipe, _packed("said", number, said, None))

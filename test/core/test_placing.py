@@ -149,7 +149,7 @@ def test_a_part_of_a_leg_lies_about_as_far_down_as_it_hangs():
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_a_leg_may_lie_turned_over_unless_where_it_hangs_tells(mirrored):
+def test_a_leg_may_lie_turned_over_unless_where_it_hangs_tells(monkeypatch, mirrored):
     *_, first, second = parted(Motion(mirrored, np.exp(1.9j), 0.8 - 0.4j))
     best = place_groups([first, second], load_templates(), Config())[0]
     assert turned_over(best, [first, second], Config()) == [None, None]  # it hangs as it lies
@@ -159,6 +159,7 @@ def test_a_leg_may_lie_turned_over_unless_where_it_hangs_tells(mirrored):
         for g in (first, second)
     ]
     best = place_groups(groups, load_templates(), Config())[0]
+    monkeypatch.setattr(placing, "STEPS", 0.0 * placing.STEPS)  # no search: that is where it lies
     stays, other = turned_over(best, groups, Config())
     assert stays is None and other.mirrored != best.motions[1].mirrored
     here, there = (m(second.points.uv @ np.array([1, 1j])) for m in (best.motions[1], other))
@@ -166,6 +167,7 @@ def test_a_leg_may_lie_turned_over_unless_where_it_hangs_tells(mirrored):
     assert abs(here.mean() - there.mean()) < 0.03
     across = np.abs(here - there)
     assert across.max() > 0.08 and np.quantile(across, 0.05) < 0.02
+    assert np.abs((here - there).imag).max() < 0.03  # as far down the leg
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

@@ -166,8 +166,8 @@ def put_beside(
     motions: Sequence[Motion],
     item: Float,
     sigma_m: float,
+    turned: Sequence[Motion | None],
     config: RotationConfig,
-    turned: Sequence[Motion | None] = (),
 ) -> Unfolded:
     """Several groups in one plane.
 
@@ -180,18 +180,17 @@ def put_beside(
         Outline of the item by which they were placed.
     sigma_m : float
         How far the places of all but the first may be off.
-    turned : sequence of Motion or None, optional
+    turned : sequence of Motion or None
         Result of turned_over for them.
     """
     parts, points, sides = [], [], []
-    others = turned or [None] * len(groups)
-    some = any(other is not None for other in others)
+    some = any(other is not None for other in turned)
     for k, (group, motion) in enumerate(zip(groups, motions, strict=True)):
         moved = [Part(part.distances, _moved(part.plane, motion)) for part in group.parts]
         parts.extend(moved)
         sigma = np.hypot(group.points.sigma_m, sigma_m if k else 0.0)
         uv = _moved(group.points.uv, motion)
-        astray = _astray_m(group, uv, others[k]) if some else None
+        astray = _astray_m(group, uv, turned[k]) if some else None
         points.append(replace(group.points, uv=uv, sigma_m=sigma, astray_m=astray))
         sides.append(-group.side if motion.mirrored else group.side)
     return together(groups, tuple(parts), points, sides, config, item)

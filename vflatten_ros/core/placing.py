@@ -36,6 +36,7 @@ ALIKE_M = 0.01  # between the middles of a group in two places that are one
 STIFF = 0.05  # of the swing that is allowed: the groups are rigid
 NEAR_M = 0.02  # beyond the main group's outline
 THIN = 4  # of these points every fourth is judged by its chords
+AS_GOOD = 2.0  # by how much a group may fit worse turned over, halves of squared sigmas
 NEAREST_M = 0.03  # from which on it counts how much farther apart points lie than they hang
 TORN_M = 0.02  # excess of a chord over the way along the flat cloth that errors make
 END_SIGMA_M = 0.002
@@ -135,7 +136,6 @@ class _Places:
         return Motion(mirrored, turn, complex(u + 1j * v - turn * arm))
 
 
-AS_GOOD = 2.0  # by how much a group may fit worse turned over, halves of squared sigmas
 STAYS = Motion(False, 1.0, 0.0)
 
 
@@ -202,34 +202,31 @@ def turned_over(placing: Placing, groups: Sequence[Group], config: Config) -> li
     """Where each group lies turned over about its place, if that is nearly as likely; else None.
 
     A leg's two seams look alike, and nothing that was seen may join them to the rest.
+
+    Parameters
+    ----------
+    placing : Placing
+        Of these groups, with motions.
+    groups : sequence of Group
+        As they were placed, the one that stays first.
+    config : Config
     """
     shapes = [_shape(group) for group in groups]
-    outline, template = placing.outline, placing.template
-    ways = cloth_ways(outline, template.seam, template.single_sheet)
-    main_m = ways.to(shapes[0].inner[::THIN])
+    images = _judging(placing, shapes[0])
     found: list[Motion | None] = [None]
     for k in range(1, len(groups)):
         others = [i for i in range(len(groups)) if i != k]
-        here = _images(
-            [shapes[i] for i in others],
-            [placing.motions[i] for i in others],
-            shapes[k],
-            outline=outline,
-            ways=ways,
-            main_m=main_m,
-        )
-        own = _places([placing.motions[k]], shapes[k])
-        other = _searched(
-            here, shapes[k], _places(_flipped(own, shapes[k]), shapes[k]), config.assembly
-        )
-        costs = [_costs(here, shapes[k], p, config.assembly)[:, 0].sum() for p in (own, other)]
-        found.append(other.motion(0, shapes[k]) if costs[1] < costs[0] + AS_GOOD else None)
+        motion, shape = placing.motions[k], shapes[k]
+        here = images([shapes[i] for i in others], [placing.motions[i] for i in others], shape)
+        own = _places([motion], shape)
+        other = _searched(here, shape, _places(_flipped(motion, shape), shape), config.assembly)
+        costs = [_costs(here, shape, p, config.assembly)[:, 0].sum() for p in (own, other)]
+        found.append(other.motion(0, shape) if costs[1] < costs[0] + AS_GOOD else None)
     return found
 
 
-def _flipped(place_: _Places, shape: _Shape) -> list[Motion]:
+def _flipped(motion: Motion, shape: _Shape) -> list[Motion]:
     """A place of a group turned over about its long and its short axis."""
-    motion = place_.motion(0, shape)
     z = motion(shape.inner)
     middle = complex(z.mean())
     axes = np.linalg.eigh(np.cov(z.real, z.imag))[1].T @ [1, 1j]
@@ -263,11 +260,8 @@ def _first_fits(
 
 def _placed(placing: Placing, shapes: Sequence[_Shape], config: Config) -> Placing:
     """Place the groups under the outline, near where they are if they are somewhere."""
-    template, assembly = placing.template, config.assembly
-    outline = placing.outline
-    ways = cloth_ways(outline, template.seam, template.single_sheet)
-    main_m = ways.to(shapes[0].inner[::THIN])
-    images = partial(_images, outline=outline, ways=ways, main_m=main_m)
+    assembly = config.assembly
+    images = _judging(placing, shapes[0])
     starts = placing.motions or _together(placing, shapes, images, assembly)
     motions, beside = [STAYS], 0.0
     for k, shape in enumerate(shapes[1:], start=1):
@@ -276,6 +270,15 @@ def _placed(placing: Placing, shapes: Sequence[_Shape], config: Config) -> Placi
         motions.append(placed.motion(0, shape))
         beside += float(_costs(here, shape, placed, assembly)[1:].sum())
     return replace(placing, motions=tuple(motions), beside=beside)
+
+
+def _judging(
+    placing: Placing, main: _Shape
+) -> Callable[[Sequence[_Shape], Sequence[Motion], _Shape], _Images]:
+    """What makes the images for a group, of those placed and their motions."""
+    template, outline = placing.template, placing.outline
+    ways = cloth_ways(outline, template.seam, template.single_sheet)
+    return partial(_images, outline=outline, ways=ways, main_m=ways.to(main.inner[::THIN]))
 
 
 def _together(

@@ -101,6 +101,7 @@ class Tried:
 
     @property
     def verdict(self) -> Verdict:
+        """All that is needed of it beside other ways."""
         return Verdict(
             category=self.found.category,
             badness=self.badness,

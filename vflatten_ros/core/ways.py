@@ -158,7 +158,7 @@ class _Draw:
             sigma_m = config.assembly.sigma_m
             turned = turned_over(placing, groups, config)
             beside = put_beside(
-                laid, placing.motions, placing.outline, sigma_m, config.rotation, turned
+                laid, placing.motions, placing.outline, sigma_m, turned, config.rotation
             )
             (only,) = (t for t in self._templates if t.category == placing.template.category)
             # all groups' ends say which way up it lies; where groups meet, the outline may not

@@ -54,7 +54,7 @@ class Item:
     def __init__(self):
         folder = BAGS / "TR1_1"
         rig = load_calibration(calibration_beside(folder))
-        self.views = gather_views(open_recording(folder), rig, CONFIG).views()[::5]
+        self.views = gather_views(open_recording(folder), rig, CONFIG).views()[::3]
         self.prepared = {view.view_id: prepare_view(view, CONFIG) for view in self.views}
         self.tried = []
         self.alone = self.flattened(None, lambda stage, _: self.tried.append(stage))

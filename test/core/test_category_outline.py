@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from flat import lying_at
 
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core.category_outline import DEEP_M, deep_inside_m, with_category
+from vflatten_ros.core.category_outline import (
+    DEEP_M,
+    deep_inside_m,
+    missing_share,
+    with_category,
+)
 from vflatten_ros.core.config import RecognitionConfig
 from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.recognition import recognise
@@ -108,3 +115,16 @@ def test_how_much_of_a_seen_outline_the_category_leaves_inside(start):
         *(np.roll(x, start, axis=0) for x in (shown.uv, shown.sigma_m, shown.inferred))
     )
     assert deep_inside_m(turned, fit) == pytest.approx(2 * (NOTCH_M - DEEP_M), abs=0.012)
+
+
+def test_what_of_the_category_is_missing_is_a_patch_and_no_strip():
+    rectangle = np.array([[0.0, 0.0], [WIDTH_M, 0.0], [WIDTH_M, LENGTH_M], [0.0, LENGTH_M]])
+    fit = SimpleNamespace(points=lambda: rectangle, template=SimpleNamespace(vertices=4))
+    share = NOTCH_M**2 / (WIDTH_M * LENGTH_M)
+    assert missing_share(notched()[0], fit) == pytest.approx(share, abs=0.006)
+    assert missing_share(notched(corners=rectangle)[0], fit) == 0.0
+    for narrower_m, missing in ((0.03, 0.0), (0.08, 0.08 / WIDTH_M)):
+        narrow = notched(corners=rectangle * [1.0 - narrower_m / WIDTH_M, 1.0])[0]
+        assert missing_share(narrow, fit) == pytest.approx(missing, abs=0.02)
+    beyond = notched(corners=rectangle * 1.1)[0]
+    assert missing_share(beyond, fit) == 0.0

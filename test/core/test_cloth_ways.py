@@ -65,6 +65,20 @@ def test_no_way_leads_from_leg_to_leg_though_they_touch():
     assert way_m(ways, middle, middle)[1] == pytest.approx(width, abs=2 * CELL_M)
 
 
+def test_no_way_leads_round_the_ends_of_legs_that_touch():
+    template = next(t for t in load_templates() if t.category == "trousers")
+    state = np.zeros(template.dimensions)
+    state[-2:] = -(template.angle[0] + np.radians(3.0)) / template.swing[0]
+    outline = template.outline(state)
+    ways = cloth_ways(outline, template.seam, template.single_sheet)
+    hem = outline[:, 1].min()
+    left = -0.06 + 1j * (hem - 0.01)  # a hem that bulges beyond the category's
+    for right in (0.06 + 1j * (hem + 0.02), 0.06 + 1j * (hem + 0.15)):
+        same, back = way_m(ways, right, left)
+        assert same == FAR
+        assert back > 1.5 * outline[template.landmarks["crotch"], 1] - hem  # up one leg, down one
+
+
 def test_every_garment_that_comes_with_the_program_has_openings_and_seams():
     for template in load_templates():
         assert len(template.seam) == template.vertices

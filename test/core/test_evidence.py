@@ -33,3 +33,22 @@ def test_a_gap_that_opens_where_the_outline_is_inferred_is_hidden_cloth(hidden):
     assert seen.weight[deep < 0.01].astype(bool).mean() == pytest.approx(
         0.95 if hidden else 1, abs=0.06
     )
+
+
+@pytest.mark.parametrize("another_gap", [False, True])
+def test_a_slit_of_the_outline_stays_whatever_other_gaps_there_are(another_gap):
+    u, v = np.meshgrid(np.arange(0, SIDE_M, STEP_M), np.arange(0, SIDE_M, STEP_M))
+    uv = np.column_stack([u.ravel(), v.ravel()])
+    gap = (uv[:, 0] < DEEP_M / 2) & (np.abs(uv[:, 1] - 0.7 * SIDE_M) < 0.02)
+    points = lying_at(uv[~(gap & another_gap)])
+    at = SIDE_M / 2
+    corners = [[0, 0], [at - 0.001, 0], [at - 0.001, 0.12], [at + 0.001, 0.12], [at + 0.001, 0]]
+    corners = np.array([*corners, [SIDE_M, 0], [SIDE_M, SIDE_M], [0, SIDE_M]])
+    share = np.arange(0.0, 1.0, 0.02)[:, None]
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    line = np.vstack([a + share * (b - a) for a, b in sides])
+    outline = Outline(line, np.full(len(line), 0.004), np.zeros(len(line), dtype=bool))
+    seen = evidence_from(outline, points, RecognitionConfig()).outline
+    assert np.linalg.norm(seen - [at, 0.1], axis=1).min() < 0.015
+    into_gap = (np.abs(seen[:, 1] - 0.7 * SIDE_M) < 0.03) & (np.abs(seen[:, 0] - 0.08) < 0.02)
+    assert into_gap.any() == another_gap

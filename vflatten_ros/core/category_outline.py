@@ -11,6 +11,7 @@ from vflatten_ros.core.template_fit import Fit, place
 from vflatten_ros.core.values import Float, Outline
 
 CELL_M = 0.002  # of the images
+COARSE_M, PATCH_M = 0.004, 0.04  # cells of images of what is missing; narrower is a strip
 CUT = 4.0  # standard deviations of a difference, from which on what was seen weighs nothing
 DEEP_M = 0.04  # inside the category's outline, which is no mere inaccuracy
 MOST_DEEP_M = 0.13  # longest stretch seen there of results that turned out right: 0.123
@@ -94,6 +95,27 @@ def deep_inside_m(outline: Outline, fit: Fit) -> float:
     odd, length = np.roll(odd, -first), np.roll(length, -first)
     stretch = np.cumsum(~odd)
     return float(np.bincount(stretch[odd], length[odd]).max())
+
+
+def missing_share(outline: Outline, fit: Fit) -> float:
+    """Share of the category's area that the outline leaves out, in patches and not in strips.
+
+    Parameters
+    ----------
+    outline : Outline
+    fit : Fit
+    """
+    category = fit.points()[: fit.template.vertices]
+    low = np.minimum(outline.uv.min(axis=0), category.min(axis=0)) - 4 * COARSE_M
+    high = np.maximum(outline.uv.max(axis=0), category.max(axis=0)) + 4 * COARSE_M
+    cols, rows = np.ceil((high - low) / COARSE_M).astype(int) + 1
+    whole, seen = np.zeros((2, rows, cols), dtype=np.uint8)
+    for image, uv in ((whole, category), (seen, outline.uv)):
+        cv2.fillPoly(image, [np.rint((uv - low) / COARSE_M * 16).astype(np.int32)], (1,), shift=4)
+    across = 2 * round(0.5 * PATCH_M / COARSE_M) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (across, across))
+    missing = cv2.morphologyEx(whole & ~seen & 1, cv2.MORPH_OPEN, disc)
+    return float(missing.sum()) / max(float(whole.sum()), 1.0)
 
 
 def _inside_m(uv: Float, low: Float, shape: tuple[int, int]) -> Float:

@@ -20,6 +20,7 @@ Complex = NDArray[np.complex128]
 CELL_M = 0.02  # of the grid of places
 SEAM_M = 0.06  # between points of a seam over which ways lead
 BESIDE_M = 0.01  # how far beyond the outline a way may lead: it is known no better
+ROUND_M = 0.04  # how far no way leads round the end of a leg that lies beside another
 ALONG = (0.25, 0.5, 0.75)  # where on a straight way it is asked whether it is on the cloth
 FLAT = 0.1  # twice the cosine of half the angle of a corner that is none
 FAR = 1e3  # m, where no way is known
@@ -139,7 +140,7 @@ def _spread(z: Complex, seam: Bool) -> Complex:
 
 
 def _pockets(z: Complex) -> Complex:
-    """(p, 2) from each inner corner of an outline outward, as far as its shorter side goes.
+    """(p, 2) from each inner corner of an outline outward, farther than its shorter side goes.
 
     The legs of trousers may lie side by side: no cloth joins them there.
     """
@@ -148,7 +149,8 @@ def _pockets(z: Complex) -> Complex:
     outward = before / np.abs(before) + after / np.abs(after)
     bent = np.abs(outward) > FLAT
     outward = np.where(bent, outward, 1.0)
-    ends = z + outward / np.abs(outward) * np.minimum(np.abs(before), np.abs(after))
+    reach_m = np.minimum(np.abs(before), np.abs(after)) + ROUND_M
+    ends = z + outward / np.abs(outward) * reach_m
     pockets: Complex = np.column_stack([z, ends])[inner & bent]
     return pockets
 

@@ -592,11 +592,11 @@ class RotationConfig(Checked):
         high=100000,
     )
     ways: int = option(
-        6,
+        7,
         "Most ways to lay the item flat that are tried; with fewer, hard items come out sooner, "
         "and more of them unknown or not to be trusted.",
         low=1,
-        high=6,
+        high=7,
     )
     landmarks: int = option(300, "Samples whose mutual distances are unfolded.", low=50, high=5000)
     local_m: float = option(

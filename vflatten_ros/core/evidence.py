@@ -156,7 +156,8 @@ def _with_gaps(
     gaps = _without_hidden(gaps, given, origin)
     if not gaps.any():
         return given
-    rest = cv2.morphologyEx(body & ~gaps & 1, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    rest = body & ~gaps & ~_slit_cells(given.uv, origin, body) & 1
+    rest = cv2.morphologyEx(rest, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     contours, _ = cv2.findContours(rest, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     largest = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
     if cv2.contourArea(largest.astype(np.float32)) < 0.6 * body.sum():
@@ -167,6 +168,13 @@ def _with_gaps(
     far, near = cKDTree(given.uv).query(uv)
     uv = np.where((far < 0.01)[:, None], given.uv[near], uv)
     return Outline(uv, given.sigma_m[near], given.inferred[near] & (far < 0.02))
+
+
+def _slit_cells(uv: Float, origin: Float, body: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Cells within a filled outline through which it runs: slits too narrow to be left bare."""
+    line = np.zeros_like(body)
+    cv2.polylines(line, [_cells(uv, origin)], isClosed=True, color=(1,), shift=4)
+    return np.asarray(line & cv2.erode(body, np.ones((3, 3), np.uint8)), dtype=np.uint8)
 
 
 def _without_hidden(gaps: NDArray[np.uint8], outline: Outline, origin: Float) -> NDArray[np.uint8]:

@@ -155,10 +155,29 @@ def unfold_group(
         samples.xyz, samples.normal, grouped.links, mask, config, progress, surface.steps
     )
     bound, near = distances.bound_m, distances.same_sheet
-    plane = grouped.places[distances.chosen]  # as the pieces were put together
+    plane = _begun(grouped.places, samples.xyz, mask, distances.chosen)
     plane = settle(plane, bound, near, config, SPREAD[-1])
     progress("outline", 0.0)
     return unfolded_from(surface, Part(distances, plane), config)
+
+
+def _begun(places: Float, xyz: Float, mask: Bool, chosen: Int) -> Float:
+    """Places (k, 2) of some samples of a group; where one has none, that of the nearest that has.
+
+    Raises
+    ------
+    DisconnectedSurface
+        None has.
+    """
+    plane = places[chosen]
+    lost = ~np.isfinite(plane).all(axis=1)
+    if lost.any():
+        known = np.flatnonzero(mask & np.isfinite(places).all(axis=1))
+        if not len(known):
+            raise DisconnectedSurface("no sample of a part of the surface can be laid flat")
+        near = cKDTree(xyz[known]).query(xyz[chosen[lost]])[1]
+        plane[lost] = places[known[near]]
+    return plane
 
 
 def put_beside(

@@ -26,6 +26,7 @@ from vflatten_ros.core.geometry import (
     twice_area,
 )
 from vflatten_ros.core.grain import Grain, notices_of, suited, typical
+from vflatten_ros.core.middle_slit import Axis, Banks, banks_of, between, middle_slit
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.puzzle import overlap as lying_on
 from vflatten_ros.core.ramps import ramps
@@ -113,6 +114,7 @@ class Surface:
     doubt: Float  # (n,) above 1: may be a ramp between two layers; 0 where nobody looked
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
+    banks: Banks | None = None  # of a slit that leads up the middle
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,6 +285,29 @@ def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationCo
         at += len(one.row)
     planes = tuple(part for one in parts for part in one.parts)
     return together(parts, planes, turned, [one.side for one in parts], config, rest)
+
+
+def parted(unfolded: Unfolded, axes: Sequence[Axis], config: RotationConfig) -> Unfolded | None:
+    """The same surface with the slit that leads up its middle; None: it has none.
+
+    Parameters
+    ----------
+    unfolded : Unfolded
+    axes : sequence of Axis
+        Of the category that it looks like.
+    config : RotationConfig
+    """
+    surface, row, points, side = unfolded.surface, unfolded.row, unfolded.points, unfolded.side
+    edge, links = _as_laid(surface, row, points.uv)
+    slit = middle_slit(points.uv, side, edge, links, axes, config)
+    if slit is None:
+        return None
+    laid, count = banks_of(points.uv, slit, config), len(surface.edge)
+    banks = Banks(np.zeros(count, dtype=np.int64), np.zeros(count))
+    banks.side[row], banks.along_m[row] = laid.side, laid.along_m
+    surface = replace(surface, banks=banks)
+    outline = _outline(surface, row, points, side, unfolded.firm, config)
+    return replace(unfolded, surface=surface, outline=outline)
 
 
 def fuse_views(
@@ -507,14 +532,22 @@ def _outline(
     item: Float | None = None,
 ) -> Outline:
     """Outline of the samples `row`, which lie where the points are."""
-    edge = edges_laid(surface, row, points.uv)
+    edge, links = _as_laid(surface, row, points.uv)
+    cuts = slits(points.uv, side, edge, links, config)
+    slit = None
+    if surface.banks is not None:
+        slit = between(points.uv, surface.banks.of(row), config)
+    return outline_of(points.uv[firm], points.sigma_m[firm], edge[firm], config, cuts, item, slit)
+
+
+def _as_laid(surface: Surface, row: Int, uv: Float) -> tuple[Int, Links]:
+    """Edges of the samples `row`, which lie at `uv`, and the links between them."""
     laid = np.zeros(len(surface.edge), dtype=bool)
     laid[row] = True
     order = np.argsort(row)
     links = surface.links.among(laid)
     links = replace(links, a=order[links.a], b=order[links.b])
-    cuts = slits(points.uv, side, edge, links, config)
-    return outline_of(points.uv[firm], points.sigma_m[firm], edge[firm], config, cuts, item)
+    return edges_laid(surface, row, uv), links
 
 
 def outline_of(
@@ -524,6 +557,7 @@ def outline_of(
     config: RotationConfig,
     cuts: Sequence[Float] = (),
     item: Float | None = None,
+    slit: Float | None = None,
 ) -> Outline:
     """Where the density of the samples falls to a share of that of a single layer.
 
@@ -537,6 +571,8 @@ def outline_of(
         Points along slits, which the outline follows if they lead into the item.
     item : ndarray of shape (c, 2), optional
         Outline within which what was not seen is hidden cloth, if the cloth around goes on there.
+    slit : ndarray of shape (m, 2), optional
+        Points along a slit that is known to lead into the item, however it looks.
     """
     extent = uv if item is None else np.vstack([uv, item])
     low = extent.min(0) - 10 * config.edge_blur_m
@@ -555,7 +591,10 @@ def outline_of(
         ends = edge > 0
         inside |= _hidden(inside, (item - low) / CELL_M, (uv[ends] - low) / CELL_M, edge[ends] == 2)
     reach = round(CUT * config.spacing_m / CELL_M)
-    inside = _cut(inside, [(cut - low) / CELL_M for cut in cuts], reach)
+    into = _leading_in(inside, [(cut - low) / CELL_M for cut in cuts])
+    if slit is not None:
+        into.append(_cells_of((slit - low) / CELL_M, inside))
+    inside = _cut(inside, into, reach)
     inside = _without_spurs(inside, round(SPUR_M / CELL_M))
     contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -610,17 +649,23 @@ def _within(uv: Float, outline: Float) -> Bool:
     return found
 
 
-def _cut(inside: NDArray[np.uint8], cuts: Sequence[Float], reach: int) -> NDArray[np.uint8]:
-    """Without thin lines through points (col, row), a few cells apart, that lead into the item."""
+def _cells_of(at: Float, inside: NDArray[np.uint8]) -> Int:
+    cells: Int = np.rint(at).astype(int).clip(0, np.array(inside.shape[::-1]) - 1)
+    return cells
+
+
+def _leading_in(inside: NDArray[np.uint8], cuts: Sequence[Float]) -> list[Int]:
+    """Cells of those points (col, row) along slits that lie deep within the item."""
     depth = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_5) * CELL_M
-    into = []
-    for cut in cuts:
-        cell = np.rint(cut).astype(int).clip(0, np.array(inside.shape[::-1]) - 1)
-        if np.median(depth[cell[:, 1], cell[:, 0]]) > DEEP_M:
-            into.append(cell)
-    if not into:
+    cells = [_cells_of(cut, inside) for cut in cuts]
+    return [cell for cell in cells if np.median(depth[cell[:, 1], cell[:, 0]]) > DEEP_M]
+
+
+def _cut(inside: NDArray[np.uint8], cuts: Sequence[Int], reach: int) -> NDArray[np.uint8]:
+    """Without thin lines through cells (col, row), a few apart, that lead into the item."""
+    points = np.vstack([*cuts, np.zeros((0, 2), dtype=np.int64)])
+    if not len(points):
         return inside
-    points = np.vstack(into)
     drawn = np.zeros_like(inside)
     drawn[points[:, 1], points[:, 0]] = 1
     border = cv2.dilate(inside, np.ones((3, 3), np.uint8)) & ~inside & 1

@@ -49,8 +49,7 @@ def slits(uv: Float, side: Float, edge: Int, links: Links, config: RotationConfi
         Of each, midway between samples of the same side that lie side by side, at edges of sheets,
         without a way from one to the other of a few links.
     """
-    ends = np.flatnonzero((edge > 0) & (side != 0))
-    laid = _Laid(uv, side, _linked(links.part(~links.rim), len(uv)), config)
+    ends, laid = _laid(uv, side, edge, links, config)
     i, j = _torn(laid, ends, BESIDE * laid.spacing_m)
     middle = (uv[i] + uv[j]) / 2
     label = _stretches(middle, laid)
@@ -71,6 +70,20 @@ def slits(uv: Float, side: Float, edge: Int, links: Links, config: RotationConfi
         if np.ptp(wide, axis=0).max() >= LONG_M:
             found.append(wide)
     return found
+
+
+def torn(
+    uv: Float, side: Float, edge: Int, links: Links, config: RotationConfig
+) -> tuple[Int, Int]:
+    """Pairs (m,) of samples of one side that lie side by side and do not hang together.
+
+    Parameters
+    ----------
+    uv, side, edge, links, config
+        As for slits.
+    """
+    ends, laid = _laid(uv, side, edge, links, config)
+    return _torn(laid, ends, BESIDE * laid.spacing_m)
 
 
 def _straight(line: Float) -> tuple[Float, Float, float]:
@@ -106,6 +119,13 @@ class _Laid:
     def way(self) -> int:
         """Links that a way round a hole has at most."""
         return max(2, round(WAY_M / self.config.link_m))
+
+
+def _laid(
+    uv: Float, side: Float, edge: Int, links: Links, config: RotationConfig
+) -> tuple[Int, _Laid]:
+    ends = np.flatnonzero((edge > 0) & (side != 0))
+    return ends, _Laid(uv, side, _linked(links.part(~links.rim), len(uv)), config)
 
 
 def _widened(laid: _Laid, line: Float, centre: Float, across: Float, ends: Int) -> Float:

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from vflatten_ros.core.category_outline import MOST_DEEP_M, deep_inside_m
+from vflatten_ros.core.category_outline import MOST_DEEP_M, deep_inside_m, missing_share
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.doubled import MISLAID, doubled_share
 from vflatten_ros.core.recognition import UNKNOWN, Recognition
@@ -33,6 +33,8 @@ STRAINED_M = 0.001  # misfit of the distances at a point that cloth laid flat se
 STRAIN, MOSTLY_STRAINED = 0.06, 0.1  # share of points with more; more that counts as 1
 EXPLAINED, MOSTLY_ODD = 0.95, 0.5  # share of the outline that is the category's; less counting as 1
 ODD = 0.5  # for a long stretch of the outline deep inside the category's
+UNSEEN, MOSTLY_UNSEEN = 0.2, 0.25  # share of the outline that no view shows; more that counts as 1
+MISSING, MOSTLY_MISSING = 0.04, 0.1  # share of the category that is not there; more counting as 1
 ASIDE = 3.0  # of the share that is left out in large groups, beside: it can be no noise
 
 
@@ -71,6 +73,18 @@ class Tried:
             return 0.0
         return doubled_share(self.unfolded.points)
 
+    @cached_property
+    def missing(self) -> float:
+        """Share of the category's area in which there is nothing, seen or hidden."""
+        if self.found.fit is None:
+            return 0.0
+        return missing_share(self.unfolded.outline, self.found.fit)
+
+    @property
+    def unseen(self) -> float:
+        """Share of the outline that no view shows."""
+        return float(self.unfolded.outline.inferred.mean())
+
     @property
     def badness(self) -> float:
         """How badly and unsurely a category fits, how far from flat it lies, what is left out.
@@ -89,7 +103,9 @@ class Tried:
         odd = max(0.0, EXPLAINED - explained) / MOSTLY_ODD
         if self.deep_m > MOST_DEEP_M:
             odd += ODD
+        odd += max(0.0, self.missing - MISSING) / MOSTLY_MISSING
         left_out += ASIDE * self.aside
+        left_out += max(0.0, self.unseen - UNSEEN) / MOSTLY_UNSEEN
         unknown = float(self.found.category == UNKNOWN)
         return float(misfit + folded + left_out + odd + 1.0 - self.sure + unknown)
 
@@ -107,7 +123,7 @@ class Tried:
             badness=self.badness,
             sure=self.sure,
             parts=len(self.unfolded.parts),
-            unseen=float(self.unfolded.outline.inferred.mean()),
+            unseen=self.unseen,
         )
 
     @property

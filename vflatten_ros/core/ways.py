@@ -14,6 +14,8 @@ import numpy as np
 from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold_group
+from vflatten_ros.core.middle_slit import axes_of
+from vflatten_ros.core.necks import cut_at_neck
 from vflatten_ros.core.placing import Group, place_groups, turned_over
 from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
 from vflatten_ros.core.rotation import (
@@ -23,6 +25,7 @@ from vflatten_ros.core.rotation import (
     doubts,
     drawn_again,
     link_surface,
+    parted,
     unfold_surface,
 )
 from vflatten_ros.core.templates import Template
@@ -30,13 +33,15 @@ from vflatten_ros.core.tried import Tried, Verdict
 from vflatten_ros.core.values import Float, Progress
 
 WHOLE = np.inf  # the doubt at which all links are believed
+NECK = 0.0  # stands for a cut: all links are believed but those across a narrow neck
 WAYS = (  # draw of the samples, greatest doubt of what joins pieces
     (0, WHOLE),
     (0, 1.0),
     (0, 0.4),
+    (0, NECK),
+    (1, NECK),
     (1, WHOLE),
     (1, 0.4),
-    (1, 1.0),
 )
 FINER = 0.8  # spacing of the samples drawn again, in that of the first
 WORTH_PLACING = 0.1  # share of the samples of a group
@@ -131,6 +136,9 @@ class _Draw:
         if doubt == WHOLE:
             unfolded = unfold_surface(self._linked, config.rotation, progress)
             return _recognised(unfolded, self._templates, config, progress)
+        if doubt == NECK:
+            grouped = cut_at_neck(self._linked, config.rotation, progress)
+            return self._from_groups(grouped, progress)
         if self._doubted is None:
             found = doubts(self._fused, config.rotation, progress)
             self._doubted = replace(self._linked, doubt=found)
@@ -163,6 +171,9 @@ class _Draw:
             (only,) = (t for t in self._templates if t.category == placing.template.category)
             # all groups' ends say which way up it lies; where groups meet, the outline may not
             begin = {only.category: (placing.pose, only.state_of(placing.template, placing.state))}
+            axes = axes_of(placing.outline, placing.pose)
+            if _like_legs(only) and parted(beside, axes, config.rotation) is not None:
+                continue  # the groups are legs
             tried = _recognised(beside, (only,), config, progress, begin)
             tries.append(replace(tried, found=_among(tried.found, odds)))
         return min(tries, key=lambda tried: tried.badness)
@@ -179,6 +190,11 @@ def _among(found: Recognition, odds: Mapping[str, float]) -> Recognition:
     return replace(found, probabilities=probabilities)
 
 
+def _like_legs(template: Template) -> bool:
+    """Whether two legs that hang against each other look like it."""
+    return not template.parts and not template.single_sheet
+
+
 def _recognised(
     unfolded: Unfolded,
     templates: tuple[Template, ...],
@@ -186,6 +202,14 @@ def _recognised(
     progress: Progress,
     begin: Mapping[str, tuple[Float, Float]] | None = None,
 ) -> Tried:
-    outline, points = unfolded.outline, unfolded.points
-    found = recognise(outline, points, templates, config.recognition, progress, begin)
+    def named(laid: Unfolded) -> Recognition:
+        outline, points = laid.outline, laid.points
+        return recognise(outline, points, templates, config.recognition, progress, begin)
+
+    found = named(unfolded)
+    if begin is None and (fit := found.fit) is not None and _like_legs(fit.template):
+        axes = axes_of(fit.points()[: fit.template.vertices], fit.pose)
+        cut = parted(unfolded, axes, config.rotation)  # are these legs?
+        if cut is not None:
+            unfolded, found = cut, named(cut)
     return Tried(unfolded, found, rotation=config.rotation)

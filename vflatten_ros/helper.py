@@ -138,6 +138,7 @@ class HelperProcess:
         """Stop, and forget the task."""
         self._send("end")
         with self._changed:
+            self._number += 1  # what it still says is of no task
             self._at, self._said, self._laid = None, {}, None
 
     # ---- the pipe

@@ -71,12 +71,12 @@ def test_no_way_leads_round_the_ends_of_legs_that_touch():
     state[-2:] = -(template.angle[0] + np.radians(3.0)) / template.swing[0]
     outline = template.outline(state)
     ways = cloth_ways(outline, template.seam, template.single_sheet)
-    hem = outline[:, 1].min()
+    hem, crotch = outline[:, 1].min(), outline[template.landmarks["crotch"], 1]
     left = -0.06 + 1j * (hem - 0.01)  # a hem that bulges beyond the category's
     for right in (0.06 + 1j * (hem + 0.02), 0.06 + 1j * (hem + 0.15)):
         same, back = way_m(ways, right, left)
         assert same == FAR
-        assert back > 1.5 * outline[template.landmarks["crotch"], 1] - hem  # up one leg, down one
+        assert back > 1.5 * (crotch - hem)  # up one leg, down the other
 
 
 def test_every_garment_that_comes_with_the_program_has_openings_and_seams():

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from flat import lying_at
 
+from vflatten_ros.categories import load_templates
 from vflatten_ros.core import hypotheses, ways
 from vflatten_ros.core import tried as judging
 from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.errors import Cancelled, DisconnectedSurface
+from vflatten_ros.core.recognition import Recognition
 from vflatten_ros.core.tried import Tried
 
 
@@ -371,8 +373,8 @@ def test_ways_that_lead_nowhere_count_for_nothing_whoever_tried_them(numbered):
     numbered.misfits, numbered.fails = {4: -0.6}, (0, 1, 2, 3)
     assert search(None).found.fit.misfit == -0.6
     assert search(Beside(numbered.misfits, fails=(2, 3))).found.fit.misfit == -0.6
-    numbered.fails = range(7)
-    for helper in (None, Beside({}, fails=range(7))):
+    numbered.fails = range(len(ways.WAYS))
+    for helper in (None, Beside({}, fails=range(len(ways.WAYS)))):
         with pytest.raises(DisconnectedSurface, match="way 0"):
             search(helper)
 
@@ -397,7 +399,7 @@ def test_what_the_caller_tries_is_left_to_it(numbered):
     """While the helper is at a way, the caller goes on to the next: seven ways, each tried once."""
     helper = Beside({}, slow=3)
     search(helper)
-    assert sorted([*numbered.tried, *helper.done]) == list(range(7))
+    assert sorted([*numbered.tried, *helper.done]) == list(range(len(ways.WAYS)))
     assert numbered.tried == [0, 1, 4, 6]
 
 
@@ -410,3 +412,49 @@ def test_the_helper_is_stopped_when_the_caller_stops(numbered):
     with pytest.raises(Cancelled):
         search(helper, cancel)
     assert helper.log == ["begin", "end"]
+
+
+@pytest.mark.parametrize("legs", [False, True])
+def test_groups_that_lie_like_a_skirt_and_are_legs_are_none(monkeypatch, legs):
+    """A category that they rule out takes no probability from the others either."""
+    known = {template.category: template for template in load_templates()}
+    placings = [
+        SimpleNamespace(
+            template=known[name],
+            cost=cost,
+            motions=(),
+            outline=np.zeros((4, 2)),
+            pose=np.zeros(3),
+            state=np.zeros(known[name].dimensions),
+        )
+        for name, cost in (("skirt", 0.0), ("shorts", 1.0))
+    ]
+    seen = []
+
+    def recognised(unfolded, templates, config, progress, begin=None):
+        seen.append(tuple(t.category for t in templates))
+        one = tried(category=templates[0].category, misfit=-0.4 if begin else 0.5)
+        none = np.zeros((0, 2))
+        found = Recognition(
+            **vars(one.found), scores={}, template_uv=none, template_seen=none > 0, fits={}
+        )
+        return replace(one, found=found)
+
+    monkeypatch.setattr(ways, "link_surface", lambda *_: None)
+    group = SimpleNamespace(points=None, side=None, outline=None)
+    monkeypatch.setattr(ways, "unfold_group", lambda *_: group)
+    monkeypatch.setattr(ways, "Group", lambda *_: None)
+    monkeypatch.setattr(ways, "place_groups", lambda *_: placings)
+    monkeypatch.setattr(ways, "turned_over", lambda *_: [])
+    monkeypatch.setattr(ways, "put_beside", lambda *_: "beside")
+    monkeypatch.setattr(ways, "axes_of", lambda *_: ())
+    monkeypatch.setattr(ways, "parted", lambda *_: "parted" if legs else None)
+    monkeypatch.setattr(ways, "_recognised", recognised)
+    draw = ways._Draw(ways.Task(0, tuple(known.values()), Config()), 0, lambda *_: None)
+    grouped = SimpleNamespace(masks=(np.ones(9, dtype=bool), np.ones(9, dtype=bool)))
+    best = draw._from_groups(grouped, lambda *_: None)
+    shorts = best.found.probabilities.get("shorts", 0.0)
+    if legs:
+        assert ("skirt",) not in seen and shorts == pytest.approx(1.0)
+    else:
+        assert ("skirt",) in seen and shorts == pytest.approx(1.0 / (1.0 + np.e))

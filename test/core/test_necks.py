@@ -22,7 +22,7 @@ CONFIG = RotationConfig(landmarks=100)
 STEP_M, SIDE_M = CONFIG.spacing_m, 0.2
 
 
-def sheets(*shifts, joined_m=0.03, far=()):
+def sheets(*shifts, joined_m=0.03):
     """Square sheets, each some way from the one before; links over the start of their edges."""
     at = np.mgrid[0:SIDE_M:STEP_M, 0:SIDE_M:STEP_M].reshape(2, -1).T
     at = at + np.random.default_rng(2).normal(0.0, 0.1 * STEP_M, at.shape)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.geometry import thinned_loop, twice_area
@@ -109,9 +110,7 @@ def missing_share(outline: Outline, fit: Fit) -> float:
     low = np.minimum(outline.uv.min(axis=0), category.min(axis=0)) - 4 * COARSE_M
     high = np.maximum(outline.uv.max(axis=0), category.max(axis=0)) + 4 * COARSE_M
     cols, rows = np.ceil((high - low) / COARSE_M).astype(int) + 1
-    whole, seen = np.zeros((2, rows, cols), dtype=np.uint8)
-    for image, uv in ((whole, category), (seen, outline.uv)):
-        cv2.fillPoly(image, [np.rint((uv - low) / COARSE_M * 16).astype(np.int32)], (1,), shift=4)
+    whole, seen = (_filled(uv, low, (rows, cols), COARSE_M) for uv in (category, outline.uv))
     across = 2 * round(0.5 * PATCH_M / COARSE_M) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (across, across))
     missing = cv2.morphologyEx(whole & ~seen & 1, cv2.MORPH_OPEN, disc)
@@ -120,8 +119,14 @@ def missing_share(outline: Outline, fit: Fit) -> float:
 
 def _inside_m(uv: Float, low: Float, shape: tuple[int, int]) -> Float:
     """How far inside a closed line every cell lies; outside negative."""
-    image = np.zeros(shape, dtype=np.uint8)
-    cv2.fillPoly(image, [np.rint((uv - low) / CELL_M * 16).astype(np.int32)], (1,), shift=4)
+    image = _filled(uv, low, shape, CELL_M)
     away: Float = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_5).astype(np.float64)
     away -= cv2.distanceTransform(1 - image, cv2.DIST_L2, cv2.DIST_MASK_5)
     return CELL_M * away
+
+
+def _filled(uv: Float, low: Float, shape: tuple[int, int], cell_m: float) -> NDArray[np.uint8]:
+    """Image that is 1 inside a closed line (n, 2), m, and begins at `low`."""
+    image = np.zeros(shape, dtype=np.uint8)
+    cv2.fillPoly(image, [np.rint((uv - low) / cell_m * 16).astype(np.int32)], (1,), shift=4)
+    return image

@@ -69,13 +69,7 @@ def group_pieces(
     found = largest_pieces(sheet, passable, int(SMALLEST * len(samples.xyz)))
     if not found:
         raise _in_shreds(len(samples.xyz))
-    flat = []
-    for k, piece in enumerate(found):
-
-        def flattening(_: str, fraction: float, done: int = k) -> None:
-            progress("pieces", (done + fraction) / len(found))
-
-        flat.append(laid_flat(surface, sheet, piece, config, flattening))
+    flat = each_flat(surface, sheet, found, config, progress)
     sides = []
     for uv, piece in zip(flat, found, strict=True):
         own = piece[sheet.a] & piece[sheet.b]
@@ -101,6 +95,33 @@ def group_pieces(
         masks,
         np.column_stack([puzzle.z.real, puzzle.z.imag]),
     )
+
+
+def each_flat(
+    surface: Surface,
+    links: Links,
+    parts: Sequence[Bool],
+    config: RotationConfig,
+    progress: Progress,
+) -> list[Float]:
+    """Places (n, 2) of the samples of each part, roughly and in a plane of its own; NaN elsewhere.
+
+    Parameters
+    ----------
+    surface : Surface
+    links : Links
+        That are believed.
+    parts : sequence of ndarray of shape (n,)
+        Which samples each has.
+    """
+    flat = []
+    for k, part in enumerate(parts):
+
+        def flattening(_: str, fraction: float, done: int = k) -> None:
+            progress("pieces", (done + fraction) / len(parts))
+
+        flat.append(laid_flat(surface, links, part, config, flattening))
+    return flat
 
 
 def _in_shreds(count: int) -> DisconnectedSurface:

@@ -92,18 +92,10 @@ def middle_slit(
 
     Parameters
     ----------
-    uv : ndarray of shape (n, 2)
-        Places of the samples.
-    side : ndarray of shape (n,)
-        1 outside up, -1 outside down, 0 unclear.
-    edge : ndarray of shape (n,)
-        Above 0 where what was seen of a sheet ends.
-    links : Links
-        Between the samples.
+    uv, side, edge, links, config
+        As for slits.
     axes : sequence of Axis
         Along which to look.
-    config : RotationConfig
-        How far apart samples are, and how far links reach.
 
     Returns
     -------
@@ -124,7 +116,16 @@ def middle_slit(
 
 
 def banks_of(uv: Float, slit: Float, config: RotationConfig) -> Banks:
-    """The samples (n, 2) along a slit (2, 2), its mouth and its end."""
+    """The samples along a slit.
+
+    Parameters
+    ----------
+    uv : ndarray of shape (n, 2)
+        Places of the samples, m.
+    slit : ndarray of shape (2, 2)
+        Its mouth and its end, m.
+    config : RotationConfig
+    """
     mouth, end = slit
     length_m = float(np.linalg.norm(end - mouth))
     ahead = (end - mouth) / length_m
@@ -135,7 +136,21 @@ def banks_of(uv: Float, slit: Float, config: RotationConfig) -> Banks:
 
 
 def between(uv: Float, banks: Banks, config: RotationConfig) -> Float:
-    """Points (m, 2) in a row along a slit, midway between its banks wherever they lie now."""
+    """Points in a row along a slit, midway between its banks wherever they lie now.
+
+    Parameters
+    ----------
+    uv : ndarray of shape (n, 2)
+        Places of the samples, m.
+    banks : Banks
+        Of these samples.
+    config : RotationConfig
+
+    Returns
+    -------
+    ndarray of shape (m, 2)
+        From beyond its mouth inward, m; none where no two banks are near each other.
+    """
     step = np.floor(banks.along_m / (STEP * config.spacing_m)).astype(np.int64)
     middle = []
     for k in np.unique(step[banks.side != 0]):

@@ -15,22 +15,28 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh, splu
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
-from vflatten_ros.core.grouping import Grouped
-from vflatten_ros.core.rotation import Surface, laid_flat
+from vflatten_ros.core.grouping import Grouped, each_flat
+from vflatten_ros.core.rotation import Surface
 from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.values import Float, Int, Progress, no_progress
 
 LEAST = 0.1  # share of the samples on either side
 MODES = 3  # of the surface, along each of which it is cut where it is narrowest
 SHIFT = 1e-3  # of the eigenvalues, for a matrix that can be factored
-LINKS = 6.0  # that lead across a line through a sheet, in each spacing of the samples
+LINKS_ACROSS = 6.0  # a line through a sheet, in each spacing of the samples
 WIDEST_M = 0.05  # that is cut
 
 
 def cut_at_neck(
     surface: Surface, config: RotationConfig, progress: Progress = no_progress
 ) -> Grouped:
-    """The two parts that hang together by least.
+    """The two parts that hang together by least, larger first.
+
+    Parameters
+    ----------
+    surface : Surface
+    config : RotationConfig
+    progress : Progress
 
     Raises
     ------
@@ -39,7 +45,7 @@ def cut_at_neck(
     """
     links, count = surface.links, len(surface.samples.xyz)
     part, across = narrowest(links, count)
-    width_m = across / LINKS * config.spacing_m
+    width_m = across / LINKS_ACROSS * config.spacing_m
     if not 0.0 < width_m < WIDEST_M:
         raise DisconnectedSurface(
             f"the surface is {100 * width_m:.0f} cm wide where it is narrowest: nothing to cut"
@@ -47,13 +53,9 @@ def cut_at_neck(
     masks = tuple(part == k for k in np.argsort(-np.bincount(part, minlength=3)[1:]) + 1)
     kept = links.part(part[links.a] == part[links.b])
     places = np.full((count, 2), np.nan)
-    for k, mask in enumerate(masks):
-
-        def flattening(_: str, fraction: float, done: int = k) -> None:
-            progress("pieces", (done + fraction) / len(masks))
-
-        flat = laid_flat(surface, kept, mask, config, flattening)
-        places[mask] = flat[mask]
+    flat = each_flat(surface, kept, masks, config, progress)
+    for mask, uv in zip(masks, flat, strict=True):
+        places[mask] = uv[mask]
     return Grouped(surface, kept, masks, places)
 
 
@@ -61,6 +63,13 @@ def narrowest(links: Links, count: int) -> tuple[Int, int]:
     """Where the largest part that hangs together does so by the fewest links, for its size.
 
     Normalized cuts (Shi and Malik 2000), along the slowest modes of its graph.
+
+    Parameters
+    ----------
+    links : Links
+        Between samples.
+    count : int
+        How many samples there are.
 
     Returns
     -------

@@ -296,6 +296,11 @@ def parted(unfolded: Unfolded, axes: Sequence[Axis], config: RotationConfig) -> 
     axes : sequence of Axis
         Of the category that it looks like.
     config : RotationConfig
+
+    Returns
+    -------
+    Unfolded or None
+        Its outline goes in and out of the slit, and will when it is laid out anew.
     """
     surface, row, points, side = unfolded.surface, unfolded.row, unfolded.points, unfolded.side
     edge, links = _as_laid(surface, row, points.uv)
@@ -650,6 +655,7 @@ def _within(uv: Float, outline: Float) -> Bool:
 
 
 def _cells_of(at: Float, inside: NDArray[np.uint8]) -> Int:
+    """The cells (m, 2), col and row, nearest to places in an image."""
     cells: Int = np.rint(at).astype(int).clip(0, np.array(inside.shape[::-1]) - 1)
     return cells
 

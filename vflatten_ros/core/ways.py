@@ -159,7 +159,7 @@ class _Draw:
         placings = place_groups(groups, self._templates, config, progress)
         least = placings[0].cost
         odds = {p.template.category: float(np.exp(least - p.cost)) for p in placings}
-        tries = [alone]
+        placed = []
         for placing in placings[:PLACED_WAYS]:
             if odds[placing.template.category] < LEAST_ODDS:
                 break
@@ -168,12 +168,16 @@ class _Draw:
             beside = put_beside(
                 laid, placing.motions, placing.outline, sigma_m, turned, config.rotation
             )
+            axes = axes_of(placing.outline, placing.pose)
+            if _like_legs(placing.template) and parted(beside, axes, config.rotation) is not None:
+                del odds[placing.template.category]  # the groups are legs
+            else:
+                placed.append((placing, beside))
+        tries = [alone]
+        for placing, beside in placed:
             (only,) = (t for t in self._templates if t.category == placing.template.category)
             # all groups' ends say which way up it lies; where groups meet, the outline may not
             begin = {only.category: (placing.pose, only.state_of(placing.template, placing.state))}
-            axes = axes_of(placing.outline, placing.pose)
-            if _like_legs(only) and parted(beside, axes, config.rotation) is not None:
-                continue  # the groups are legs
             tried = _recognised(beside, (only,), config, progress, begin)
             tries.append(replace(tried, found=_among(tried.found, odds)))
         return min(tries, key=lambda tried: tried.badness)

@@ -65,6 +65,17 @@ def test_what_does_not_hang_together_with_the_largest_part_is_in_neither():
     assert half > 100  # a sheet, through its middle: the other one is not cut off
 
 
+def test_what_hangs_by_less_but_is_small_stays_with_its_sheet():
+    xyz, sheet, links = sheets([SIDE_M, 0.0, 0.0])
+    tag = (xyz[:, 0] < 0.03) & (xyz[:, 1] > SIDE_M - 0.03)
+    to_it = np.flatnonzero(tag[links.a] != tag[links.b])
+    kept = np.ones(len(links.a), dtype=bool)
+    kept[to_it[2:]] = False
+    part, across = narrowest(links.part(kept), len(xyz))
+    assert across == (sheet[links.a] != sheet[links.b]).sum() > 2
+    assert set(part[tag]) == {part[sheet == 0][0]} == set(part[sheet == 0])
+
+
 def test_nothing_is_cut_of_which_there_is_nothing():
     none = np.zeros(0, dtype=np.int64)
     part, across = narrowest(Links(none, none, none.astype(float), none > 0, none.astype(float)), 5)

@@ -106,6 +106,18 @@ def test_the_outline_does_not_follow_what_runs_along_it():
     assert np.array_equal(shut, line)
 
 
+def test_the_outline_follows_a_slit_that_is_known_wherever_it_runs():
+    uv, _, edge, _ = layers(cloth(0.0), cloth(0.0, up=-1.0))
+    sigma = np.full(len(uv), 0.002)
+    line = np.column_stack([np.full(80, 0.012), np.linspace(-0.01, 0.12, 80)])
+    shut, taken, known = (
+        outline_of(uv, sigma, edge, CONFIG, cuts, slit=slit).uv
+        for cuts, slit in (((), None), ((line,), None), ((), line))
+    )
+    assert np.array_equal(shut, taken)  # for the edge along the side of a rim
+    assert twice_area(known) < twice_area(shut) - 0.002
+
+
 def test_a_slit_may_go_on_among_strays_beyond_the_outline():
     uv, side, edge, links = layers(cloth(0.12), cloth(0.12, up=-1.0))
     sigma = np.full(len(uv), 0.002)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import cv2
 import numpy as np
 import pytest
 from recordings import BAGS
@@ -177,6 +178,27 @@ def test_three_times_the_noise_is_seen_to():
     assert max(wrong) < 0.07  # not with rotation.widen false
     assert "coarse_points" in {notice.code for notice in garment.notices}
     assert point_error_m(garment, BAGS / "SH1_1") < 0.01
+    assert not untrusted(garment)
+
+
+@pytest.mark.slow
+def test_noise_that_neighbouring_points_have_in_common_is_seen_to():
+    """Bumps of 3 mm, 1.5 cm across, in each view others: as matching blocks of images gives."""
+    rig = load_calibration(calibration_beside(BAGS / "SH1_1"))
+    views = gather_views(open_recording(BAGS / "SH1_1"), rig, ALL_VIEWS).views()
+    rng = np.random.default_rng(11)
+    noisy = []
+    for view in views:
+        bumps = cv2.GaussianBlur(rng.normal(size=view.shape), (0, 0), 6)
+        deeper = 0.003 * bumps[tuple(view.pixel.T)] / bumps.std()
+        points = view.points_rig * (1.0 + deeper / view.points_rig[:, 2])[:, None]
+        noisy.append(dataclasses.replace(view, points_rig=points))
+    garment = pipeline.flatten_garment(noisy, (), load_templates(), ALL_VIEWS)
+    category, wrong = errors(garment, BAGS / "SH1_1")
+    assert garment.category == category
+    assert max(wrong) < 0.04
+    assert "coarse_points" in {notice.code for notice in garment.notices}
+    assert point_error_m(garment, BAGS / "SH1_1") < 0.006
     assert not untrusted(garment)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.grain import Grain, grain_of, notices_of, suited, typical
+from vflatten_ros.core.grain import Grain, borne_out, grain_of, notices_of, suited, typical
 
 
 def curved(pitch_m, noise_m, radius_m=0.05):
@@ -61,6 +61,17 @@ def test_nothing_is_widened_without_end_nor_against_the_setting():
     assert wider.spacing_m > widest.spacing_m
     never = RotationConfig(widen=False)
     assert suited(never, Grain(0.01, 0.01)) == never
+
+
+def test_noise_that_a_view_hides_counts_once_other_views_tell_of_it():
+    grain = Grain(0.0006, 0.0025)
+    # neighbours that have little of their noise in common: surfaces about as far apart
+    assert borne_out(grain, 0.0006) == borne_out(grain, 0.0) == grain
+    # all of 3 mm in common: two such surfaces are sqrt(2) times as far apart
+    told = borne_out(grain, 0.003 * np.sqrt(2))
+    assert told.pitch_m == grain.pitch_m
+    assert told.noise_m == pytest.approx(np.hypot(0.0006, 0.003) / np.sqrt(1.5))
+    assert suited(RotationConfig(), told).view_fit_m > 1.5 * RotationConfig().view_fit_m
 
 
 def test_the_typical_view_is_the_median():

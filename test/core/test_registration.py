@@ -11,7 +11,13 @@ from vflatten_ros.core import registration
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.geometry import inverse, rotation_about, transform_points
-from vflatten_ros.core.registration import fold_in, register_views, view_surface
+from vflatten_ros.core.grain import typical
+from vflatten_ros.core.registration import (
+    disagreement_m,
+    fold_in,
+    register_views,
+    view_surface,
+)
 from vflatten_ros.core.values import Calibration, View
 
 CALIBRATION = Calibration(
@@ -29,8 +35,11 @@ def body():
     return xyz, np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
 
 
-def views_of(motions, noise_m=0.0, calibration=CALIBRATION, assumed=CALIBRATION):
-    """Views at even angles of the body, moved before it turns by (shift_m, lag_rad)."""
+def views_of(motions, noise_m=0.0, calibration=CALIBRATION, assumed=CALIBRATION, shared_m=0.0):
+    """Views at even angles of the body, moved before it turns by (shift_m, lag_rad).
+
+    Neighbouring points of a view have noise of shared_m in common, along the line of sight.
+    """
     xyz, normal = body()
     views, rng = [], np.random.default_rng(7)
     for k, (shift, lag) in enumerate(motions):
@@ -42,9 +51,18 @@ def views_of(motions, noise_m=0.0, calibration=CALIBRATION, assumed=CALIBRATION)
             moved, axis=1
         )
         points = moved[facing] + rng.normal(0, noise_m, (int(facing.sum()), 3))
+        if shared_m:
+            points = points * (1.0 + shared_m * bumps(points, rng) / points[:, 2:])
         pixel = np.zeros((len(points), 2), dtype=np.int32)
         views.append(View(k, k, angle, points, pixel, None, (480, 360), assumed))
     return views
+
+
+def bumps(points, rng, width_m=0.015):
+    """(n, 1) noise of standard deviation 1 that points nearer than width_m have in common."""
+    wave = rng.normal(0, 1 / width_m, (64, 3))
+    phase = rng.uniform(0, 2 * np.pi, 64)
+    return np.cos(points @ wave.T + phase).sum(1, keepdims=True) / np.sqrt(32)
 
 
 def places(poses, motions):
@@ -125,6 +143,23 @@ def test_a_shifted_axis_is_found_from_all_views():
         fixed.append(transform_points(pose, raw[-1]))
     assert np.linalg.norm(raw - np.mean(raw, axis=0), axis=2).mean() > 0.003
     assert np.linalg.norm(fixed - np.mean(fixed, axis=0), axis=2).mean() < 0.0006
+
+
+def test_views_tell_of_noise_that_neighbouring_points_have_in_common():
+    still, config = [(np.zeros(3), 0.0)] * 16, RotationConfig()
+    apart, alone = {}, {}
+    for shared_m in (0.0, 0.001, 0.003):
+        views = views_of(still, noise_m=0.0005, shared_m=shared_m)
+        surfaces = [view_surface(v, config) for v in views]
+        alone[shared_m] = typical([s.grain for s in surfaces]).noise_m
+        poses = register_views(surfaces, config)
+        apart[shared_m] = disagreement_m(surfaces, poses, config)
+    assert apart[0.0] < 0.0005
+    for shared_m in (0.001, 0.003):  # of both views; the surfaces are seen at an angle
+        assert 0.6 * shared_m < apart[shared_m] / np.sqrt(2) < shared_m
+    assert alone[0.003] < 1.5 * alone[0.0]  # no view shows it by itself
+    two_sides = [surfaces[0], surfaces[8]]
+    assert disagreement_m(two_sides, [np.eye(4)] * 2, config) == 0.0  # nothing seen by both
 
 
 def test_normals_point_to_the_camera():

@@ -21,6 +21,7 @@ AROUND = 20  # points through which a plane is laid
 LOOKED_AT = 2000  # points of a view, at most
 SEEN_SHARE = 0.75  # of the noise, most that neighbouring points do not have in common
 MOST_NOISE, MOST_PITCH = 4.0, 2.5  # times what the config is for, beyond which nothing is widened
+SURE = 1.15  # times the noise that a view shows, beyond which what other views tell counts
 TOLD_NOISE, TOLD_PITCH = 1.4, 1.3  # times, beyond which the result says so
 
 
@@ -28,7 +29,9 @@ TOLD_NOISE, TOLD_PITCH = 1.4, 1.3  # times, beyond which the result says so
 class Grain:
     """Of the points on the item."""
 
-    noise_m: float  # standard deviation from the planes of their nearest neighbours
+    noise_m: (
+        float  # standard deviation from the planes of their nearest neighbours, or see borne_out
+    )
     pitch_m: float  # to the nearest neighbour
 
 
@@ -43,6 +46,22 @@ def grain_of(points: Float) -> Grain:
     across = np.linalg.eigvalsh(around.transpose(0, 2, 1) @ around)[:, 0].clip(0.0)
     noise = np.sqrt(np.median(across) / (AROUND - 3))  # a plane takes three of them
     return Grain(float(noise), float(np.median(distance[:, 1])))
+
+
+def borne_out(grain: Grain, apart_m: float) -> Grain:
+    """The grain that suits points whose neighbours have noise in common, which one view hides.
+
+    Parameters
+    ----------
+    grain : Grain
+        Typical of the views.
+    apart_m : float
+        Standard deviation of overlapping views' surfaces from each other: of what the points of a
+        view have in common, twice. Of the noise that the config is for it is as large as the
+        noise of the points; the same lengths suit if the sum of both is the same.
+    """
+    both = np.hypot(grain.noise_m, apart_m / np.sqrt(2.0)) / np.sqrt(1.5)
+    return replace(grain, noise_m=float(both)) if both > SURE * grain.noise_m else grain
 
 
 def typical(grains: Sequence[Grain]) -> Grain:

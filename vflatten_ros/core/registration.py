@@ -10,7 +10,7 @@ last ones included, and held by a prior: without it smooth legs slide along them
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
 
@@ -31,6 +31,7 @@ PAIR_POINTS = 300.0  # noise is alike in neighbouring pixels: more pairs than th
 MOST_PARTNERS = 4  # on either side of a view
 FOLD_ROUNDS = 3  # of placing one view by those before it
 SETTLED = 2e-5  # step, metres and radians, far below the noise
+NORMAL_MAD = 1.4826  # standard deviation of a normal distribution, in median deviations
 AXIS = 4  # numbers of the axis error: two of its lean, two of its place
 NEIGHBOURS, RADIUS_M, LEAST = 24, 0.012, 8  # most points of a plane of this radius, and fewest
 
@@ -47,12 +48,14 @@ class ViewSurface:
     index: Int  # (n,) row of the view's points
     camera: Float  # (3,) hanger frame
     tree: cKDTree  # of smooth
-    grain: Grain  # of the points
+    grain: Grain  # of the points, or as other views tell
     sight: Sight | None = None  # in the hanger frame; None if the cloud is not that of a camera
     features: Features = NO_FEATURES  # of the smooth surface, hanger frame
 
 
-def view_surface(view: View, config: RotationConfig, prints: bool = False) -> ViewSurface:
+def view_surface(
+    view: View, config: RotationConfig, prints: bool = False, noise_m: float = 0.0
+) -> ViewSurface:
     """Local planes of one view's points. Needs no other view: do it as the view arrives.
 
     Points with too few neighbours for a plane (flying pixels, shreds) are left out.
@@ -63,6 +66,8 @@ def view_surface(view: View, config: RotationConfig, prints: bool = False) -> Vi
     config : RotationConfig
     prints : bool
         Look for features of the colour image, too.
+    noise_m : float
+        Least noise of the points: other views may tell of more than shows in this one.
 
     Raises
     ------
@@ -78,6 +83,7 @@ def view_surface(view: View, config: RotationConfig, prints: bool = False) -> Vi
         )
     camera = T_hanger_rig[:3, 3]
     grain = grain_of(points)
+    grain = replace(grain, noise_m=max(grain.noise_m, noise_m))
     smooth, normals, count = _planes(points, suited(config, grain).view_fit_m)
     normals = normals * np.where(((camera - points) * normals).sum(1) < 0, -1.0, 1.0)[:, None]
     row = np.flatnonzero(count >= LEAST)
@@ -202,8 +208,7 @@ def register_views(
         raise NotEnoughViews(f"registration: got {len(surfaces)} views, expected 2 or more")
     poses = list(fold_in(surfaces, config, so_far).poses)
     config = suited(config, typical([surface.grain for surface in surfaces]))
-    pairs = _overlapping([s.angle_rad for s in surfaces], config.overlap_deg)
-    partners = [[i for i, j in pairs if j == to] for to in range(len(surfaces))]
+    partners = _partners(surfaces, config)
     thin = [_thinned(s, config.register_points) for s in surfaces]
     prior = _prior(surfaces, config)
     for done in range(config.register_rounds):
@@ -221,6 +226,48 @@ def register_views(
         if np.abs(step).max() < SETTLED:
             break
     return poses
+
+
+def disagreement_m(
+    surfaces: Sequence[ViewSurface], poses: Sequence[Float], config: RotationConfig
+) -> float:
+    """How far the surfaces of overlapping views are apart: a robust standard deviation.
+
+    Where neighbouring points of a view have little of their noise in common, it is about as
+    large as their noise; errors that they have in common (of matching blocks, or of an item that
+    does not hang still) make it larger.
+
+    Parameters
+    ----------
+    surfaces : sequence of ViewSurface
+    poses : sequence of ndarray of shape (4, 4)
+        Result of register_views for them.
+    config : RotationConfig
+
+    Returns
+    -------
+    float
+        Zero if no views overlap.
+    """
+    config = suited(config, typical([surface.grain for surface in surfaces]))
+    partners = _partners(surfaces, config)
+    placed = zip(surfaces, poses, strict=True)
+    moved = {
+        i: _seen_from(surface, _thinned(surface, config.register_points), pose)
+        for i, (surface, pose) in enumerate(placed)
+    }
+
+    def errors(of_view: tuple[Sequence[int], ViewSurface, Float]) -> Float:
+        return _residuals(moved, config, of_view).error
+
+    found = np.concatenate(list(mapped(errors, zip(partners, surfaces, poses, strict=True))))
+    return float(NORMAL_MAD * np.median(np.abs(found))) if len(found) else 0.0
+
+
+def _partners(surfaces: Sequence[ViewSurface], config: RotationConfig) -> list[list[int]]:
+    """Of each view, those that see the same cloth."""
+    pairs = _overlapping([s.angle_rad for s in surfaces], config.overlap_deg)
+    return [[i for i, j in pairs if j == to] for to in range(len(surfaces))]
 
 
 def _overlapping(angles: Sequence[float], reach_deg: float) -> list[tuple[int, int]]:
@@ -310,6 +357,40 @@ def _seen_from(surface: ViewSurface, rows: Int, pose: Float) -> tuple[Float, Flo
     return transform_points(pose, surface.smooth[rows]), surface.normals[rows] @ pose[:3, :3].T
 
 
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """Distances of other views' points from a view's surface."""
+
+    owner: Int  # (n,) view that each point is of
+    at: Float  # (n, 3) the points, common frame
+    normal: Float  # (n, 3) of the surface there
+    error: Float  # (n,) m
+
+
+def _residuals(
+    moved: Mapping[int, tuple[Float, Float]],
+    config: RotationConfig,
+    of_view: tuple[Sequence[int], ViewSurface, Float],
+) -> _Residuals:
+    """Of the points that lie near the view's surface; as _equations."""
+    partners, surface, pose = of_view
+    if not partners:
+        none = np.zeros((0, 3))
+        return _Residuals(np.zeros(0, dtype=np.int64), none, none, none[:, 0])
+    owner = np.repeat(partners, [len(moved[i][0]) for i in partners])
+    a = np.vstack([moved[i][0] for i in partners])
+    normals_i = np.vstack([moved[i][1] for i in partners])
+    inside_j = transform_points(inverse(pose), a)
+    distance, near = surface.tree.query(inside_j, distance_upper_bound=config.register_reach_m)
+    found = np.flatnonzero(np.isfinite(distance))
+    n = surface.normals[near[found]] @ pose[:3, :3].T
+    alike = (normals_i[found] * n).sum(1) > 0.8
+    found, n = found[alike], n[alike]
+    a, owner = a[found], owner[found]
+    b = transform_points(pose, surface.smooth[near[found]])
+    return _Residuals(owner, a, n, ((a - b) * n).sum(1))
+
+
 def _equations(
     moved: Mapping[int, tuple[Float, Float]],
     config: RotationConfig,
@@ -330,26 +411,13 @@ def _equations(
     list of (int, ndarray of shape (6, 6), ndarray of shape (6,))
         Partner, information, gradient.
     """
-    partners, surface, pose = of_view
-    if not partners:
-        return []
-    owner = np.repeat(partners, [len(moved[i][0]) for i in partners])
-    a = np.vstack([moved[i][0] for i in partners])
-    normals_i = np.vstack([moved[i][1] for i in partners])
-    inside_j = transform_points(inverse(pose), a)
-    distance, near = surface.tree.query(inside_j, distance_upper_bound=config.register_reach_m)
-    found = np.flatnonzero(np.isfinite(distance))
-    n = surface.normals[near[found]] @ pose[:3, :3].T
-    alike = (normals_i[found] * n).sum(1) > 0.8
-    found, n = found[alike], n[alike]
-    a, owner = a[found], owner[found]
-    b = transform_points(pose, surface.smooth[near[found]])
-    error = ((a - b) * n).sum(1)
+    found = _residuals(moved, config, of_view)
+    error = found.error
     robust = config.noise_m**-2 / (1 + (error / (config.noise_m * 2)) ** 2)
-    jacobian = np.hstack([np.cross(a, n), n])
+    jacobian = np.hstack([np.cross(found.at, found.normal), found.normal])
     equations = []
-    for i in partners:
-        mine = owner == i
+    for i in of_view[0]:
+        mine = found.owner == i
         count = int(mine.sum())
         if count < 10:
             continue

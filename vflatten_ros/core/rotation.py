@@ -5,7 +5,7 @@ Like the pipeline, this module knows the order of its stages, which do not know 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import cv2
@@ -25,12 +25,18 @@ from vflatten_ros.core.geometry import (
     transform_points,
     twice_area,
 )
-from vflatten_ros.core.grain import Grain, notices_of, suited, typical
+from vflatten_ros.core.grain import Grain, borne_out, notices_of, suited, typical
 from vflatten_ros.core.middle_slit import Axis, Banks, banks_of, between, middle_slit
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.puzzle import overlap as lying_on
 from vflatten_ros.core.ramps import ramps
-from vflatten_ros.core.registration import Folded, ViewSurface, register_views, view_surface
+from vflatten_ros.core.registration import (
+    Folded,
+    ViewSurface,
+    disagreement_m,
+    register_views,
+    view_surface,
+)
 from vflatten_ros.core.sheets import Links, link_samples, outward, sheet_edges
 from vflatten_ros.core.sight import PlacedSight, goes_on
 from vflatten_ros.core.slide import neighbours, slide_m
@@ -347,17 +353,8 @@ def fuse_views(
     ------
     NotEnoughViews
     """
-    done, features = prepared or {}, prints is not None and prints.features
-
-    def surface(view: View) -> ViewSurface:
-        return done.get(view.view_id) or view_surface(view, config, features)
-
-    progress("surface", 0.0)
-    surfaces: list[ViewSurface] = []
-    for each in mapped(surface, views):
-        surfaces.append(each)
-        progress("surface", len(surfaces) / len(views))
-    poses = register_views(surfaces, config, progress, so_far)
+    features = prints is not None and prints.features
+    surfaces, poses = _registered(views, config, progress, prepared or {}, features, so_far)
     grain = typical([surface.grain for surface in surfaces])
     notices = notices_of(config, grain)
     config = suited(config, grain)
@@ -395,6 +392,44 @@ def fuse_views(
         if surface.sight is not None
     )
     return Fused(samples, points, view_ids, point_pixel, grain, sights, checked, notices)
+
+
+def _registered(
+    views: Sequence[View],
+    config: RotationConfig,
+    progress: Progress,
+    prepared: Mapping[int, ViewSurface],
+    features: bool,
+    so_far: Folded | None,
+) -> tuple[list[ViewSurface], list[Float]]:
+    """Surface and pose of each view; anew, where they tell of more noise than any one shows."""
+
+    def surface(view: View) -> ViewSurface:
+        return prepared.get(view.view_id) or view_surface(view, config, features)
+
+    def surface_again(view: View) -> ViewSurface:
+        return view_surface(view, config, features, noisier.noise_m)
+
+    surfaces = _each(surface, views, progress)
+    poses = register_views(surfaces, config, progress, so_far)
+    grain = typical([surface.grain for surface in surfaces])
+    noisier = borne_out(grain, disagreement_m(surfaces, poses, config))
+    if suited(config, noisier) == suited(config, grain):
+        return surfaces, poses
+    surfaces = _each(surface_again, views, progress)
+    placed = Folded(tuple(surfaces), tuple(poses), config)
+    return surfaces, register_views(surfaces, config, progress, placed)
+
+
+def _each(
+    surface: Callable[[View], ViewSurface], views: Sequence[View], progress: Progress
+) -> list[ViewSurface]:
+    progress("surface", 0.0)
+    surfaces: list[ViewSurface] = []
+    for each in mapped(surface, views):
+        surfaces.append(each)
+        progress("surface", len(surfaces) / len(views))
+    return surfaces
 
 
 def drawn_again(fused: Fused, draw: int, config: RotationConfig, progress: Progress) -> Fused:

@@ -12,7 +12,7 @@ from recordings import BAGS
 
 from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core import grouping, parallel, pipeline, rotation, ways
+from vflatten_ros.core import grain, grouping, parallel, pipeline, rotation, ways
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.files import calibration_beside, load_calibration
@@ -223,3 +223,10 @@ def test_an_outline_that_its_category_does_not_explain_is_not_trusted(monkeypatc
     monkeypatch.setattr(pipeline, "MOST_DEEP_M", -1.0)
     garment = replay_recording(BAGS / "SH1_1", ALL_VIEWS).garment
     assert any("far inside" in n.text for n in garment.notices if n.code == "untrusted")
+
+
+@pytest.mark.slow
+def test_points_as_noisy_as_layers_are_thick_are_not_trusted(monkeypatch):
+    monkeypatch.setattr(grain, "TRUSTED_NOISE", 0.9)
+    garment = replay_recording(BAGS / "SH1_1", ALL_VIEWS).garment
+    assert any("cannot be told apart" in n.text for n in garment.notices if n.code == "untrusted")

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.grain import Grain, borne_out, grain_of, notices_of, suited, typical
+from vflatten_ros.core.grain import (
+    Grain,
+    borne_out,
+    grain_of,
+    notices_of,
+    suited,
+    too_noisy,
+    typical,
+)
 
 
 def curved(pitch_m, noise_m, radius_m=0.05):
@@ -87,3 +97,10 @@ def test_coarse_points_are_told_with_how_coarse_they_are():
         assert notice.code == "coarse_points"
         assert f"by {1e3 * grain.noise_m:.1f} mm" in notice.text
         assert f"are {1e3 * grain.pitch_m:.1f} mm apart" in notice.text
+
+
+def test_beyond_three_times_the_noise_nothing_is_trusted():
+    config = RotationConfig()
+    assert too_noisy(config, Grain(0.0022, 0.004)) == ""
+    assert "scatter by 2.3 mm, 3.1 times as much" in too_noisy(config, Grain(0.0023, 0.002))
+    assert too_noisy(replace(config, noise_m=0.002), Grain(0.0023, 0.002)) == ""

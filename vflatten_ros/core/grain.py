@@ -22,6 +22,7 @@ LOOKED_AT = 2000  # points of a view, at most
 SEEN_SHARE = 0.75  # of the noise, most that neighbouring points do not have in common
 MOST_NOISE, MOST_PITCH = 4.0, 2.5  # times what the config is for, beyond which nothing is widened
 SURE = 1.15  # times the noise that a view shows, beyond which what other views tell counts
+TRUSTED_NOISE = 3.0  # times, beyond which layers that touch are one, and legs a skirt
 TOLD_NOISE, TOLD_PITCH = 1.4, 1.3  # times, beyond which the result says so
 
 
@@ -108,6 +109,17 @@ def notices_of(config: RotationConfig, grain: Grain) -> tuple[Notice, ...]:
         "hold the item nearer to the rig"
     )
     return (Notice("coarse_points", text),)
+
+
+def too_noisy(config: RotationConfig, grain: Grain) -> str:
+    """Why no result from such points should be trusted; empty: it may be."""
+    times = _times(config, grain)[0]
+    if times <= TRUSTED_NOISE:
+        return ""
+    return (
+        f"the points scatter by {1e3 * grain.noise_m:.1f} mm, {times:.1f} times as much as the "
+        "method is set for: layers that touch cannot be told apart"
+    )
 
 
 def _times(config: RotationConfig, grain: Grain) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from vflatten_ros.core.automatic_pair import fill_up, flatten_best_pair
 from vflatten_ros.core.category_outline import MOST_DEEP_M, deep_inside_m, with_category
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
-from vflatten_ros.core.grain import suited
+from vflatten_ros.core.grain import suited, too_noisy
 from vflatten_ros.core.hypotheses import Helper, likeliest
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.model_images import model_image_scores
@@ -157,6 +157,7 @@ def _rotation(
         config.correspondences,
         so_far,
     )
+    noisy = too_noisy(config.rotation, fused.grain)
     config = replace(config, rotation=suited(config.rotation, fused.grain))
     given, told = fused.given, fused.notices + fused.given.notices
     best = likeliest(fused, tuple(templates), config, progress, helper)
@@ -191,7 +192,7 @@ def _rotation(
         astray = float((unfolded.points.astray_m > 0.0).mean())
         text = f"a part, {100 * astray:.0f} % of what was seen, fits as well turned over"
         notices = (*notices, Notice("turned_over", text))
-    reason = _odd(unfolded.outline, found) or best.untrusted
+    reason = _odd(unfolded.outline, found) or best.untrusted or noisy
     if reason:
         notices = (*notices, Notice("untrusted", reason))
     placed_m = config.assembly.sigma_m if len(unfolded.parts) > 1 else 0.0

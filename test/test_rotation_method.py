@@ -78,6 +78,7 @@ def test_category_sizes_and_places_come_out_right(name):
     if name != "LS1_1":  # trusted or not by the rounding of the machine: see bags/README.md
         assert not untrusted(garment)
     assert askew_m(garment, BAGS / name) < 0.02
+    assert not {n.code for n in garment.notices} & {"coarse_points", "smoothed_depth"}
 
 
 @pytest.mark.slow
@@ -179,6 +180,23 @@ def test_three_times_the_noise_is_seen_to():
     assert "coarse_points" in {notice.code for notice in garment.notices}
     assert point_error_m(garment, BAGS / "SH1_1") < 0.01
     assert not untrusted(garment)
+
+
+def test_depth_that_went_through_a_filter_is_told():
+    """A median over 5 by 5 pixels, as some drivers offer it."""
+    rig = load_calibration(calibration_beside(BAGS / "SK2_1"))
+    views = gather_views(open_recording(BAGS / "SK2_1"), rig, ALL_VIEWS).views()
+    smooth = []
+    for view in views:
+        row, col = view.pixel.T
+        image = np.zeros(view.shape, np.float32)
+        image[row, col] = view.points_rig[:, 2]
+        filtered = cv2.medianBlur(image, 5)
+        depth = np.where(np.abs(filtered - image) < 0.02, filtered, image)[row, col]
+        points = view.points_rig * (depth / view.points_rig[:, 2])[:, None]
+        smooth.append(dataclasses.replace(view, points_rig=points))
+    (notice,) = rotation.fuse_views(smooth, ALL_VIEWS.rotation).notices
+    assert notice.code == "smoothed_depth"
 
 
 @pytest.mark.slow

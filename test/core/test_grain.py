@@ -91,9 +91,9 @@ def test_the_typical_view_is_the_median():
 
 def test_coarse_points_are_told_with_how_coarse_they_are():
     config = RotationConfig()
-    assert notices_of(config, Grain(0.8 * config.noise_m, 1.1 * config.pitch_m)) == ()
+    assert notices_of(config, Grain(0.8 * config.noise_m, 1.1 * config.pitch_m), 0.0) == ()
     for grain in (Grain(0.002, 0.002), Grain(0.0005, 0.004)):
-        (notice,) = notices_of(config, grain)
+        (notice,) = notices_of(config, grain, grain.noise_m)
         assert notice.code == "coarse_points"
         assert f"by {1e3 * grain.noise_m:.1f} mm" in notice.text
         assert f"are {1e3 * grain.pitch_m:.1f} mm apart" in notice.text
@@ -104,3 +104,10 @@ def test_beyond_three_times_the_noise_nothing_is_trusted():
     assert too_noisy(config, Grain(0.0022, 0.004)) == ""
     assert "scatter by 2.3 mm, 3.1 times as much" in too_noisy(config, Grain(0.0023, 0.002))
     assert too_noisy(replace(config, noise_m=0.002), Grain(0.0023, 0.002)) == ""
+
+
+def test_smoothed_depth_is_told_by_views_that_differ_more_than_their_points_scatter():
+    config, grain = RotationConfig(), Grain(0.0003, 0.0025)
+    assert notices_of(config, grain, 0.0005) == ()
+    (notice,) = notices_of(config, grain, 0.0008)
+    assert notice.code == "smoothed_depth" and "differ by 0.8 mm" in notice.text

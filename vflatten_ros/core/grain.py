@@ -22,6 +22,7 @@ LOOKED_AT = 2000  # points of a view, at most
 SEEN_SHARE = 0.75  # of the noise, most that neighbouring points do not have in common
 MOST_NOISE, MOST_PITCH = 4.0, 2.5  # times what the config is for, beyond which nothing is widened
 SURE = 1.15  # times the noise that a view shows, beyond which what other views tell counts
+SMOOTHED = 2.0  # times that noise, as far as views differ if filters have taken most of it away
 TRUSTED_NOISE = 3.0  # times, beyond which layers that touch are one, and legs a skirt
 TOLD_NOISE, TOLD_PITCH = 1.4, 1.3  # times, beyond which the result says so
 
@@ -97,8 +98,24 @@ def suited(config: RotationConfig, grain: Grain) -> RotationConfig:
     return replace(config, **wider)
 
 
-def notices_of(config: RotationConfig, grain: Grain) -> tuple[Notice, ...]:
-    """Says that the points are much coarser than the config is for, if they are."""
+def notices_of(config: RotationConfig, grain: Grain, apart_m: float) -> tuple[Notice, ...]:
+    """Says that the points are much coarser than the config is for, or smoothed, if they are.
+
+    Parameters
+    ----------
+    config : RotationConfig
+    grain : Grain
+        Typical of the views, other views heard.
+    apart_m : float
+        Standard deviation of overlapping views' surfaces from each other.
+    """
+    if apart_m > SMOOTHED * grain.noise_m:
+        text = (
+            f"views differ by {1e3 * apart_m:.1f} mm where the points of one scatter by "
+            f"{1e3 * grain.noise_m:.1f} mm only: filters that smooth the depth, or matching of "
+            "large blocks, join layers; turn them off"
+        )
+        return (Notice("smoothed_depth", text),)
     noise, pitch = _times(config, grain)
     if noise <= TOLD_NOISE and pitch <= TOLD_PITCH:
         return ()

@@ -354,9 +354,10 @@ def fuse_views(
     NotEnoughViews
     """
     features = prints is not None and prints.features
-    surfaces, poses = _registered(views, config, progress, prepared or {}, features, so_far)
+    registered = _registered(views, config, progress, prepared or {}, features, so_far)
+    surfaces, poses = registered.surfaces, registered.poses
     grain = typical([surface.grain for surface in surfaces])
-    notices = notices_of(config, grain)
+    notices = notices_of(config, grain, registered.apart_m)
     config = suited(config, grain)
     looked = []
     if prints is not None and features:
@@ -394,6 +395,13 @@ def fuse_views(
     return Fused(samples, points, view_ids, point_pixel, grain, sights, checked, notices)
 
 
+@dataclass(frozen=True, eq=False)
+class _Registered:
+    surfaces: Sequence[ViewSurface]
+    poses: Sequence[Float]  # (4, 4) each: takes its hanger coordinates to the common ones
+    apart_m: float  # of the surfaces of overlapping views
+
+
 def _registered(
     views: Sequence[View],
     config: RotationConfig,
@@ -401,7 +409,7 @@ def _registered(
     prepared: Mapping[int, ViewSurface],
     features: bool,
     so_far: Folded | None,
-) -> tuple[list[ViewSurface], list[Float]]:
+) -> _Registered:
     """Surface and pose of each view; anew, where they tell of more noise than any one shows."""
 
     def surface(view: View) -> ViewSurface:
@@ -413,12 +421,14 @@ def _registered(
     surfaces = _each(surface, views, progress)
     poses = register_views(surfaces, config, progress, so_far)
     grain = typical([surface.grain for surface in surfaces])
-    noisier = borne_out(grain, disagreement_m(surfaces, poses, config))
+    apart_m = disagreement_m(surfaces, poses, config)
+    noisier = borne_out(grain, apart_m)
     if suited(config, noisier) == suited(config, grain):
-        return surfaces, poses
+        return _Registered(surfaces, poses, apart_m)
     surfaces = _each(surface_again, views, progress)
     placed = Folded(tuple(surfaces), tuple(poses), config)
-    return surfaces, register_views(surfaces, config, progress, placed)
+    poses = register_views(surfaces, config, progress, placed)
+    return _Registered(surfaces, poses, apart_m)
 
 
 def _each(

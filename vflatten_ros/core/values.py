@@ -286,6 +286,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "turned_over": "a part may lie turned over: what is on it may be mistaken for its opposite",
     "correspondence_rejected": "a corresponding point contradicts the others",
     "coarse_points": "the points are noisier, or farther apart, than the method is set for",
+    "smoothed_depth": "the depth was smoothed over, which joins layers: turn its filters off",
     "views_misplaced": "a print on the cloth contradicts the registration of the views",
     "views_chosen": "which views the two-view method chose by itself",
     "high_stress": "the distances contradict each other more than noise explains",

@@ -12,7 +12,7 @@ from recordings import BAGS
 
 from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core import grain, grouping, parallel, pipeline, rotation, ways
+from vflatten_ros.core import fused, grain, grouping, parallel, pipeline, rotation, ways
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.files import calibration_beside, load_calibration
@@ -195,7 +195,7 @@ def test_depth_that_went_through_a_filter_is_told():
         depth = np.where(np.abs(filtered - image) < 0.02, filtered, image)[row, col]
         points = view.points_rig * (depth / view.points_rig[:, 2])[:, None]
         smooth.append(dataclasses.replace(view, points_rig=points))
-    (notice,) = rotation.fuse_views(smooth, ALL_VIEWS.rotation).notices
+    (notice,) = fused.fuse_views(smooth, ALL_VIEWS.rotation).notices
     assert notice.code == "smoothed_depth"
 
 

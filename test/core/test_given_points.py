@@ -11,7 +11,8 @@ from sheet import seen_from
 
 from vflatten_ros.core.config import IntegrationConfig, RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
-from vflatten_ros.core.rotation import TOLD_M, fuse_views, link_surface
+from vflatten_ros.core.fused import fuse_views
+from vflatten_ros.core.rotation import TOLD_M, link_surface
 from vflatten_ros.core.sheets import Links
 
 ANGLES = (-0.6, -0.3, 0.0, 0.3, 0.6)

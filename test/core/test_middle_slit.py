@@ -14,7 +14,8 @@ from vflatten_ros.core import ways
 from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.middle_slit import OPEN_M, Axis, axes_of, banks_of, between, middle_slit
-from vflatten_ros.core.rotation import Surface, Unfolded, outline_of
+from vflatten_ros.core.outline import outline_of
+from vflatten_ros.core.rotation import Surface, Unfolded
 from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.values import no_progress

@@ -10,7 +10,8 @@ from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.distances import link_steps
 from vflatten_ros.core.fusion import Samples
 from vflatten_ros.core.geometry import twice_area
-from vflatten_ros.core.rotation import Laid, Surface, edges_laid, outline_of, together
+from vflatten_ros.core.outline import outline_of
+from vflatten_ros.core.rotation import Laid, Surface, edges_laid, together
 from vflatten_ros.core.sheets import Links
 
 CONFIG = RotationConfig()

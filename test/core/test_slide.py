@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sheet import a_print, plain, seen_from
 
-from vflatten_ros.core import rotation
+from vflatten_ros.core import fused
 from vflatten_ros.core.config import CorrespondenceConfig, RotationConfig
 from vflatten_ros.core.geometry import rigid
 from vflatten_ros.core.slide import neighbours
@@ -28,23 +28,23 @@ def slid(steps_m):
 
 @pytest.mark.parametrize("colour, told", [(a_print, True), (plain, False), (None, False)])
 def test_views_that_were_slid_are_told_where_there_is_a_print(monkeypatch, colour, told):
-    monkeypatch.setattr(rotation, "register_views", slid(0.006))
-    fused = rotation.fuse_views(views(colour), CONFIG, prints=PRINTS)
-    assert [notice.code for notice in fused.notices] == ["views_misplaced"] * told
+    monkeypatch.setattr(fused, "register_views", slid(0.006))
+    found = fused.fuse_views(views(colour), CONFIG, prints=PRINTS)
+    assert [notice.code for notice in found.notices] == ["views_misplaced"] * told
     if told:
-        assert "6 mm" in fused.notices[0].text
+        assert "6 mm" in found.notices[0].text
 
 
 def test_views_in_their_place_are_not(monkeypatch):
-    monkeypatch.setattr(rotation, "register_views", slid(0.0))
-    assert rotation.fuse_views(views(a_print), CONFIG, prints=PRINTS).notices == ()
+    monkeypatch.setattr(fused, "register_views", slid(0.0))
+    assert fused.fuse_views(views(a_print), CONFIG, prints=PRINTS).notices == ()
 
 
 def test_nothing_is_checked_unless_asked_for(monkeypatch):
-    monkeypatch.setattr(rotation, "register_views", slid(0.006))
+    monkeypatch.setattr(fused, "register_views", slid(0.006))
     none = CorrespondenceConfig(check_pairs=0)
-    assert rotation.fuse_views(views(a_print), CONFIG, prints=none).notices == ()
-    assert rotation.fuse_views(views(a_print), CONFIG).notices == ()
+    assert fused.fuse_views(views(a_print), CONFIG, prints=none).notices == ()
+    assert fused.fuse_views(views(a_print), CONFIG).notices == ()
 
 
 def test_neighbours_are_spread_round_the_turn():

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.geometry import twice_area
-from vflatten_ros.core.rotation import outline_of
+from vflatten_ros.core.outline import outline_of
 from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.slits import AWAY, slits
 

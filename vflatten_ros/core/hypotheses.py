@@ -13,7 +13,7 @@ from typing import Protocol
 
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface
-from vflatten_ros.core.rotation import Fused
+from vflatten_ros.core.fused import Fused
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.tried import Tried, Verdict, best_of, rival, settled
 from vflatten_ros.core.values import Progress

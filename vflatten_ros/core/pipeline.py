@@ -12,6 +12,7 @@ from vflatten_ros.core.automatic_pair import fill_up, flatten_best_pair
 from vflatten_ros.core.category_outline import MOST_DEEP_M, deep_inside_m, with_category
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
+from vflatten_ros.core.fused import fuse_views
 from vflatten_ros.core.grain import suited, too_noisy
 from vflatten_ros.core.hypotheses import Helper, likeliest
 from vflatten_ros.core.measurement import measure
@@ -26,7 +27,7 @@ from vflatten_ros.core.recognition import (
     recognise_again,
 )
 from vflatten_ros.core.registration import Folded, ViewSurface, view_surface
-from vflatten_ros.core.rotation import fuse_views, turn_parts
+from vflatten_ros.core.rotation import turn_parts
 from vflatten_ros.core.template_fit import place
 from vflatten_ros.core.templates import Template
 from vflatten_ros.core.two_views import flatten_two_views, named_views

@@ -13,17 +13,16 @@ import numpy as np
 
 from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
+from vflatten_ros.core.fused import Fused, drawn_again
 from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold_group
 from vflatten_ros.core.middle_slit import axes_of
 from vflatten_ros.core.necks import cut_at_neck
 from vflatten_ros.core.placing import Group, place_groups, turned_over
 from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
 from vflatten_ros.core.rotation import (
-    Fused,
     Surface,
     Unfolded,
     doubts,
-    drawn_again,
     link_surface,
     parted,
     unfold_surface,

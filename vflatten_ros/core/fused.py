@@ -1,0 +1,184 @@
+"""All views of a rotation to one model of the hanging item: registered, then fused to samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vflatten_ros.core.config import CorrespondenceConfig, IntegrationConfig, RotationConfig
+from vflatten_ros.core.correspondences import NOTHING_GIVEN, Judged, judged, place_view
+from vflatten_ros.core.fusion import Points, Samples, fuse
+from vflatten_ros.core.geometry import transform_directions, transform_points
+from vflatten_ros.core.grain import Grain, borne_out, notices_of, suited, typical
+from vflatten_ros.core.parallel import mapped
+from vflatten_ros.core.registration import (
+    Folded,
+    ViewSurface,
+    disagreement_m,
+    register_views,
+    view_surface,
+)
+from vflatten_ros.core.sight import PlacedSight
+from vflatten_ros.core.slide import neighbours, slide_m
+from vflatten_ros.core.slide import notice_of as slide_notice
+from vflatten_ros.core.values import Correspondence, Float, Int, Notice, Progress, View, no_progress
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """Samples of the whole visible surface."""
+
+    samples: Samples
+    points: Points  # that the samples were fitted to
+    view_ids: Int  # (v,) of the points' views
+    point_pixel: Int  # (m, 2)
+    grain: Grain  # of the points, median of the views
+    sights: tuple[PlacedSight, ...] = ()  # none: whether cloth goes on is told by the samples
+    given: Judged = NOTHING_GIVEN  # corresponding points
+    notices: tuple[Notice, ...] = ()
+
+    @property
+    def view_id(self) -> Int:
+        """(n,) of the measured point nearest to each sample."""
+        view: Int = self.points.view[self.samples.source]
+        return self.view_ids[view]
+
+    @property
+    def pixel(self) -> Int:
+        """(n, 2) of that point."""
+        return self.point_pixel[self.samples.source]
+
+
+def fuse_views(
+    views: Sequence[View],
+    config: RotationConfig,
+    progress: Progress = no_progress,
+    prepared: Mapping[int, ViewSurface] | None = None,
+    given: Sequence[Correspondence] = (),
+    limits: IntegrationConfig | None = None,
+    prints: CorrespondenceConfig | None = None,
+    so_far: Folded | None = None,
+) -> Fused:
+    """Register and fuse the views.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Of one rotation, two or more.
+    config : RotationConfig
+    progress : Progress
+    prepared : mapping of int to ViewSurface, optional
+        Results of view_surface by view_id, made as the views arrived.
+    given : sequence of Correspondence
+        By a person. Those that the registration bears out join the surface.
+    limits : IntegrationConfig, optional
+    prints : CorrespondenceConfig, optional
+        With it, features of some neighbouring views check the registration.
+    so_far : Folded, optional
+        Result of fold_in for some of the views, made as they arrived.
+
+    Raises
+    ------
+    NotEnoughViews
+    """
+    features = prints is not None and prints.features
+    registered = _registered(views, config, progress, prepared or {}, features, so_far)
+    surfaces, poses = registered.surfaces, registered.poses
+    grain = typical([surface.grain for surface in surfaces])
+    notices = notices_of(config, grain, registered.apart_m)
+    config = suited(config, grain)
+    looked = []
+    if prints is not None and features:
+        looked = neighbours({view.view_id: view.angle_rad for view in views}, prints.check_pairs)
+    named = {i for pair in given for i in (pair.view_a, pair.view_b)}
+    named |= {i for pair in looked for i in pair}
+    placed = {
+        view.view_id: place_view(view, surface, pose)
+        for view, surface, pose in zip(views, surfaces, poses, strict=True)
+        if view.view_id in named
+    }
+    count = [len(surface.points) for surface in surfaces]
+    placed_points = zip(poses, surfaces, strict=True)
+    placed_normals = zip(poses, surfaces, strict=True)
+    points = Points(
+        xyz=np.vstack([transform_points(pose, s.points) for pose, s in placed_points]),
+        normal=np.vstack([transform_directions(pose, s.normals) for pose, s in placed_normals]),
+        view=np.repeat(np.arange(len(surfaces), dtype=np.int32), count),
+    )
+    view_ids = np.array([view.view_id for view in views], dtype=np.int64)
+    point_pixel = np.vstack([v.pixel[s.index] for v, s in zip(views, surfaces, strict=True)])
+    samples = fuse(points, config, progress)
+    slid = None
+    if prints is not None and looked:
+        progress("fuse", 0.9)
+        slid = slide_m([(placed[i], placed[j]) for i, j in looked], prints)
+    if prints is not None and slid is not None and slid > prints.slide_m:
+        notices = (*notices, slide_notice(slid))
+    checked = judged(given, placed, limits or IntegrationConfig())
+    sights = tuple(
+        PlacedSight(surface.sight, pose)
+        for surface, pose in zip(surfaces, poses, strict=True)
+        if surface.sight is not None
+    )
+    return Fused(samples, points, view_ids, point_pixel, grain, sights, checked, notices)
+
+
+@dataclass(frozen=True, eq=False)
+class _Registered:
+    surfaces: Sequence[ViewSurface]
+    poses: Sequence[Float]  # (4, 4) each: takes its hanger coordinates to the common ones
+    apart_m: float  # of the surfaces of overlapping views
+
+
+def _registered(
+    views: Sequence[View],
+    config: RotationConfig,
+    progress: Progress,
+    prepared: Mapping[int, ViewSurface],
+    features: bool,
+    so_far: Folded | None,
+) -> _Registered:
+    """Surface and pose of each view; anew, where they tell of more noise than any one shows."""
+
+    def surface(view: View) -> ViewSurface:
+        return prepared.get(view.view_id) or view_surface(view, config, features)
+
+    def surface_again(view: View) -> ViewSurface:
+        return view_surface(view, config, features, noisier.noise_m)
+
+    surfaces = _each(surface, views, progress)
+    poses = register_views(surfaces, config, progress, so_far)
+    grain = typical([surface.grain for surface in surfaces])
+    apart_m = disagreement_m(surfaces, poses, config)
+    noisier = borne_out(grain, apart_m)
+    if suited(config, noisier) == suited(config, grain):
+        return _Registered(surfaces, poses, apart_m)
+    surfaces = _each(surface_again, views, progress)
+    placed = Folded(tuple(surfaces), tuple(poses), config)
+    poses = register_views(surfaces, config, progress, placed)
+    return _Registered(surfaces, poses, apart_m)
+
+
+def _each(
+    surface: Callable[[View], ViewSurface], views: Sequence[View], progress: Progress
+) -> list[ViewSurface]:
+    progress("surface", 0.0)
+    surfaces: list[ViewSurface] = []
+    for each in mapped(surface, views):
+        surfaces.append(each)
+        progress("surface", len(surfaces) / len(views))
+    return surfaces
+
+
+def drawn_again(fused: Fused, draw: int, config: RotationConfig, progress: Progress) -> Fused:
+    """The same points with other samples: where layers touch, what joins them hangs on a hair.
+
+    Parameters
+    ----------
+    fused : Fused
+        Result of fuse_views, which has draw 0.
+    draw : int
+    """
+    return replace(fused, samples=fuse(fused.points, config, progress, draw))

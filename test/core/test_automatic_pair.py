@@ -89,6 +89,20 @@ def test_pairs_are_valued_by_the_cloth_that_they_show_in_one_piece():
     assert frozenset((0, 4)) not in by_ids or not by_ids[frozenset((0, 4))].value
 
 
+def test_a_view_without_a_patch_of_its_own_joins_nothing():
+    """Pixels far apart, as of cloth too shiny for stereo."""
+    thin = slice(None, None, 15)
+    full = VIEWS[2]
+    scattered = dataclasses.replace(
+        full, points_rig=full.points_rig[thin], pixel=full.pixel[thin], rgb=None
+    )
+    views = [VIEWS[1], scattered, VIEWS[3]]
+    values = pair_values(placed_views(views, CONFIG, no_progress, {}), CONFIG)
+    by_ids = {frozenset((v.view_a, v.view_b)): v for v in values}
+    assert by_ids[frozenset((1, 3))].value > 0.5
+    assert not any(v.value for ids, v in by_ids.items() if 2 in ids)
+
+
 def test_points_given_by_hand_choose_the_views_and_come_first():
     places = ((0.0, -0.03), (0.02, -0.2), (-0.02, -0.12))
     given = [sheet.pair_at(VIEWS[2:4], FLATS[2:4], *place) for place in places]

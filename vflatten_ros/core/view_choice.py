@@ -153,7 +153,7 @@ def _value(
     graph = coo_matrix((np.ones(len(i)), (i, count[0] + j)), shape=(sum(count),) * 2)
     piece = connected_components(graph, directed=False)[1]
     piece_a, piece_b = (
-        np.where(s.patch >= 0, own[s.patch], -1)
+        np.append(own, -1)[s.patch]  # none for points in no patch, if there is any
         for s, own in ((a, piece[: count[0]]), (b, piece[count[0] :]))
     )
     also = (in_a >= 0) & (a.all_patch[in_a] >= 0)

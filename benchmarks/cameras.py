@@ -67,7 +67,8 @@ were read, each view by other chance, and flattened with all views and no manual
 camera is like any line of this table; it shows what kind of error matters. "Right" is the category;
 sizes are errors of W and L, in per cent; "points" is the mean over the recordings of the median
 distance of flattened points from the truth. An unorganised cloud, or one with fewer pixels, has no
-pixels by which its points could be compared with the truth.
+pixels by which its points could be compared with the truth. What is done about bumps and fat edges,
+and why filters of the depth are better turned off, is in [rotation.md](rotation.md).
 """
 
 

@@ -541,6 +541,10 @@ class RotationConfig(Checked):
         True,
         "Widen the lengths of fits, samples and links where points are noisier or farther apart.",
     )
+    trim_edges: bool = option(
+        True,
+        "Take pixels off that stereo adds beside edges, where other views tell of them.",
+    )
     view_fit_m: float = option(
         0.012, "Radius of the local planes of a single view, m.", low=0.002, high=0.1
     )

@@ -9,6 +9,9 @@ import numpy as np
 
 from vflatten_ros.core.config import CorrespondenceConfig, IntegrationConfig, RotationConfig
 from vflatten_ros.core.correspondences import NOTHING_GIVEN, Judged, judged, place_view
+from vflatten_ros.core.edges import inside_edges, pixels_to_edge, with_rows
+from vflatten_ros.core.fat_edges import fat_px
+from vflatten_ros.core.fat_edges import notice_of as fat_notice
 from vflatten_ros.core.fusion import Points, Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.grain import Grain, borne_out, notices_of, suited, typical
@@ -87,7 +90,7 @@ def fuse_views(
     registered = _registered(views, config, progress, prepared or {}, features, so_far)
     surfaces, poses = registered.surfaces, registered.poses
     grain = typical([surface.grain for surface in surfaces])
-    notices = notices_of(config, grain, registered.apart_m)
+    notices = registered.notices + notices_of(config, grain, registered.apart_m)
     config = suited(config, grain)
     looked = []
     if prints is not None and features:
@@ -130,6 +133,7 @@ class _Registered:
     surfaces: Sequence[ViewSurface]
     poses: Sequence[Float]  # (4, 4) each: takes its hanger coordinates to the common ones
     apart_m: float  # of the surfaces of overlapping views
+    notices: tuple[Notice, ...] = ()
 
 
 def _registered(
@@ -140,25 +144,52 @@ def _registered(
     features: bool,
     so_far: Folded | None,
 ) -> _Registered:
-    """Surface and pose of each view; anew, where they tell of more noise than any one shows."""
+    """Surface and pose of each view.
+
+    Anew, where together they tell of fat edges, or of more noise than any one of them shows.
+    """
 
     def surface(view: View) -> ViewSurface:
         return prepared.get(view.view_id) or view_surface(view, config, features)
 
-    def surface_again(view: View) -> ViewSurface:
-        return view_surface(view, config, features, noisier.noise_m)
+    def anew(noise_m: float) -> tuple[list[ViewSurface], list[Float]]:
+        def surface_again(view: View) -> ViewSurface:
+            return view_surface(view, config, features, noise_m)
 
-    surfaces = _each(surface, views, progress)
+        surfaces = _each(surface_again, seen, progress)
+        placed = Folded(tuple(surfaces), tuple(poses), config)
+        return surfaces, register_views(surfaces, config, progress, placed)
+
+    seen, notices = list(views), tuple[Notice, ...]()
+    surfaces = _each(surface, seen, progress)
     poses = register_views(surfaces, config, progress, so_far)
-    grain = typical([surface.grain for surface in surfaces])
-    apart_m = disagreement_m(surfaces, poses, config)
+    grain, apart_m = _told_by_all(surfaces, poses, config)
+    rows = None
+    if config.trim_edges and all(surface.sight is not None for surface in surfaces):
+        to_edge = [pixels_to_edge(view, grain.pitch_m) for view in views]
+        at_points = [near[s.index] for near, s in zip(to_edge, surfaces, strict=True)]
+        px = fat_px(surfaces, poses, at_points, config, grain.pitch_m)
+        if px:
+            notices = (fat_notice(px),)
+            rows = [inside_edges(v, near, px) for v, near in zip(views, to_edge, strict=True)]
+            seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
+            surfaces, poses = anew(0.0)
+            grain, apart_m = _told_by_all(surfaces, poses, config)
     noisier = borne_out(grain, apart_m)
-    if suited(config, noisier) == suited(config, grain):
-        return _Registered(surfaces, poses, apart_m)
-    surfaces = _each(surface_again, views, progress)
-    placed = Folded(tuple(surfaces), tuple(poses), config)
-    poses = register_views(surfaces, config, progress, placed)
-    return _Registered(surfaces, poses, apart_m)
+    if suited(config, noisier) != suited(config, grain):
+        surfaces, poses = anew(noisier.noise_m)
+    if rows is not None:
+        pairs = zip(surfaces, rows, strict=True)
+        surfaces = [replace(s, index=kept[s.index]) for s, kept in pairs]
+    return _Registered(surfaces, poses, apart_m, notices)
+
+
+def _told_by_all(
+    surfaces: Sequence[ViewSurface], poses: Sequence[Float], config: RotationConfig
+) -> tuple[Grain, float]:
+    """Typical grain, and how far surfaces are apart."""
+    grain = typical([surface.grain for surface in surfaces])
+    return grain, disagreement_m(surfaces, poses, config)
 
 
 def _each(

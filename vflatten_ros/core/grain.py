@@ -62,8 +62,8 @@ def borne_out(grain: Grain, apart_m: float) -> Grain:
         view have in common, twice. Of the noise that the config is for it is as large as the
         noise of the points; the same lengths suit if the sum of both is the same.
     """
-    both = np.hypot(grain.noise_m, apart_m / np.sqrt(2.0)) / np.sqrt(1.5)
-    return replace(grain, noise_m=float(both)) if both > SURE * grain.noise_m else grain
+    both = float(np.hypot(grain.noise_m, apart_m / np.sqrt(2.0)) / np.sqrt(1.5))
+    return replace(grain, noise_m=both) if both > SURE * grain.noise_m else grain
 
 
 def typical(grains: Sequence[Grain]) -> Grain:

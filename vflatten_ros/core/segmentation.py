@@ -11,13 +11,13 @@ All lengths are metric: the image's resolution enters only by the spacing measur
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.arrays import frozen
 from vflatten_ros.core.config import SegmentationConfig
+from vflatten_ros.core.edges import farther_around
 from vflatten_ros.core.errors import EmptyView
 from vflatten_ros.core.pieces import centres, dominant_plane, pieces, plane_distance
 from vflatten_ros.core.values import Bool, Calibration, Cloud, Float, Int, View
@@ -27,7 +27,6 @@ Pixels = NDArray[np.int32]
 SAMPLE = 1500  # points from which spacing and planes are estimated
 WALLS = 3  # most planes taken away
 LEVEL = 0.7  # least cosine between the axis and the normal of a table or floor
-HOLE_PX = 5  # width of the gaps in the item that are no borders of it
 SIDE = 0.1  # share of the image at either side in which no item is expected
 
 
@@ -110,16 +109,8 @@ def _within_edges(
     """
     if not cloud.organised:
         return np.ones(len(pixel), dtype=bool)
-    trim = config.trim_px
-    low = pixel.min(axis=0) - trim - HOLE_PX
-    row, col = (pixel - low).T
-    item = np.zeros(pixel.max(axis=0) - low + 1 + trim + HOLE_PX, np.uint8)
-    item[row, col] = 1
-    closed = cv2.morphologyEx(item, cv2.MORPH_CLOSE, np.ones((HOLE_PX, HOLE_PX), np.uint8))
-    depth = np.where(closed > 0, -np.inf, np.inf).astype(np.float32)  # a hole is no border
-    depth[row, col] = cloud.xyz[pixel[:, 0], pixel[:, 1], 2]
-    farthest = cv2.dilate(depth, np.ones((2 * trim + 1, 2 * trim + 1), np.uint8))  # as a block
-    kept: Bool = farthest[row, col] - depth[row, col] <= tolerance
+    depth = cloud.xyz[pixel[:, 0], pixel[:, 1], 2]
+    kept: Bool = farther_around(pixel, depth, config.trim_px)[-1] <= tolerance
     return kept
 
 

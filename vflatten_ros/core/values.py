@@ -287,6 +287,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "correspondence_rejected": "a corresponding point contradicts the others",
     "coarse_points": "the points are noisier, or farther apart, than the method is set for",
     "smoothed_depth": "the depth was smoothed over, which joins layers: turn its filters off",
+    "fat_edges": "stereo has made edges wider: what it added was taken off",
     "views_misplaced": "a print on the cloth contradicts the registration of the views",
     "views_chosen": "which views the two-view method chose by itself",
     "high_stress": "the distances contradict each other more than noise explains",

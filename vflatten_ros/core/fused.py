@@ -148,6 +148,7 @@ def _registered(
 
     Anew, where together they tell of fat edges, or of more noise than any one of them shows.
     """
+    seen, rows, notices = list(views), None, tuple[Notice, ...]()
 
     def surface(view: View) -> ViewSurface:
         return prepared.get(view.view_id) or view_surface(view, config, features)
@@ -160,28 +161,38 @@ def _registered(
         placed = Folded(tuple(surfaces), tuple(poses), config)
         return surfaces, register_views(surfaces, config, progress, placed)
 
-    seen, notices = list(views), tuple[Notice, ...]()
     surfaces = _each(surface, seen, progress)
     poses = register_views(surfaces, config, progress, so_far)
     grain, apart_m = _told_by_all(surfaces, poses, config)
-    rows = None
-    if config.trim_edges and all(surface.sight is not None for surface in surfaces):
-        to_edge = [pixels_to_edge(view, grain.pitch_m) for view in views]
-        at_points = [near[s.index] for near, s in zip(to_edge, surfaces, strict=True)]
-        px = fat_px(surfaces, poses, at_points, config, grain.pitch_m)
-        if px:
-            notices = (fat_notice(px),)
-            rows = [inside_edges(v, near, px) for v, near in zip(views, to_edge, strict=True)]
-            seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
-            surfaces, poses = anew(0.0)
-            grain, apart_m = _told_by_all(surfaces, poses, config)
+    px, within = _edges(views, surfaces, poses, config, grain)
+    if px:
+        rows, notices = within, (fat_notice(px),)
+        seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
+        surfaces, poses = anew(0.0)
+        grain, apart_m = _told_by_all(surfaces, poses, config)
     noisier = borne_out(grain, apart_m)
     if suited(config, noisier) != suited(config, grain):
         surfaces, poses = anew(noisier.noise_m)
     if rows is not None:
         pairs = zip(surfaces, rows, strict=True)
-        surfaces = [replace(s, index=kept[s.index]) for s, kept in pairs]
+        surfaces = [replace(surface, index=kept[surface.index]) for surface, kept in pairs]
     return _Registered(surfaces, poses, apart_m, notices)
+
+
+def _edges(
+    views: Sequence[View],
+    surfaces: Sequence[ViewSurface],
+    poses: Sequence[Float],
+    config: RotationConfig,
+    grain: Grain,
+) -> tuple[int, list[Int]]:
+    """By how many pixels edges are fat, and the rows of each view's points without those."""
+    if not config.trim_edges or any(surface.sight is None for surface in surfaces):
+        return 0, []
+    to_edge = [pixels_to_edge(view, grain.pitch_m) for view in views]
+    at_points = [near[s.index] for near, s in zip(to_edge, surfaces, strict=True)]
+    px = fat_px(surfaces, poses, at_points, config, grain.pitch_m)
+    return px, [inside_edges(v, near, px) for v, near in zip(views, to_edge, strict=True)]
 
 
 def _told_by_all(

@@ -31,9 +31,7 @@ TOLD_NOISE, TOLD_PITCH = 1.4, 1.3  # times, beyond which the result says so
 class Grain:
     """Of the points on the item."""
 
-    noise_m: (
-        float  # standard deviation from the planes of their nearest neighbours, or see borne_out
-    )
+    noise_m: float  # standard deviation from the planes of neighbours; more, as borne_out says
     pitch_m: float  # to the nearest neighbour
 
 

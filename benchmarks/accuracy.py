@@ -166,7 +166,7 @@ def compare(folder: Path, run: str, pictures: Path) -> Row | None:
             result = garment_result(replayed.garment, replayed.views)
             notes += [notice["code"] for notice in result["notices"]]
         except VFlattenError as error:
-            notes.append(str(error))
+            notes.append(str(error).replace(str(folder), folder.name))
     seconds = time.perf_counter() - started
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     row = judged(folder, truth, result, seconds, tuple(notes))

@@ -31,6 +31,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 from accuracy import ROOT, Row, judged, recordings
 from numpy.typing import NDArray
 from report import row, table_head
@@ -51,7 +52,6 @@ from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.results import garment_result
 
 Image = NDArray[np.float32]  # (rows, cols): depth, m, NaN where unmeasured
-Xyz = NDArray[np.float32]  # (rows, cols, 3)
 Random = np.random.Generator
 STEP_AT_M = 1.3  # depth at which steps of disparity are named
 BUMP_PX = 6.0  # standard deviation of the blur that makes bumps
@@ -293,7 +293,6 @@ def compare(task: tuple[str, Path]) -> Row:
     name, folder = task
     print(f"{name}: {folder.name}", file=sys.stderr)
     camera = next(camera for camera in CAMERAS if camera.name == name)
-    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     config = dataclasses.replace(Config(), method="rotation")
     segmentation = dataclasses.replace(config.segmentation, trim_px=camera.trim_px)
     config = dataclasses.replace(config, segmentation=segmentation)
@@ -305,7 +304,8 @@ def compare(task: tuple[str, Path]) -> Row:
     )
     random = np.random.default_rng([SEED, *folder.name.encode()])
     calibration = load_calibration(calibration_beside(folder))
-    known = {name: truth["camera"][name] for name in ("fx", "fy", "cx", "cy")}
+    values = yaml.safe_load((folder / "calibration.yaml").read_text(encoding="utf-8"))
+    known = {name: values["camera"][name] for name in ("fx", "fy", "cx", "cy")}
     rig = Rig(**known, top_m=calibration.gripper_tip[1])
     recording.alter = partial(camera.alter, random=random, rig=rig)
     try:
@@ -314,7 +314,8 @@ def compare(task: tuple[str, Path]) -> Row:
         result = dict(garment_result(garment, views))
         notes = [notice["code"] for notice in result["notices"]]
     except VFlattenError as error:
-        notes.append(str(error))
+        notes.append(str(error).replace(str(folder), folder.name))
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     if not camera.same_pixels:
         result.pop("points", None)
     return judged(folder, truth, result, 0.0, tuple(notes))

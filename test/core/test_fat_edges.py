@@ -105,5 +105,5 @@ def test_steps_within_the_item_are_edges_of_what_is_in_front_and_holes_are_none(
 
 
 def test_the_notice_says_what_to_set():
-    assert "segmentation.trim_px: 2" in notice_of(2).text and "2 pixels" in notice_of(2).text
+    assert "2 more in segmentation.trim_px" in notice_of(2).text and "2 pixels" in notice_of(2).text
     assert "1 pixel," in notice_of(1).text

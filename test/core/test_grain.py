@@ -111,3 +111,5 @@ def test_smoothed_depth_is_told_by_views_that_differ_more_than_their_points_scat
     assert notices_of(config, grain, 0.0005) == ()
     (notice,) = notices_of(config, grain, 0.0008)
     assert notice.code == "smoothed_depth" and "differ by 0.8 mm" in notice.text
+    both = notices_of(config, replace(grain, pitch_m=0.005), 0.0008)  # and far apart
+    assert [notice.code for notice in both] == ["smoothed_depth", "coarse_points"]

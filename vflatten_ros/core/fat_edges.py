@@ -70,7 +70,7 @@ def notice_of(px: int) -> Notice:
     return Notice(
         "fat_edges",
         f"edges are fat by {px} pixel{'s' * (px > 1)}, as stereo makes them: taken off; "
-        f"segmentation.trim_px: {px} does so as views arrive, and sooner",
+        f"{px} more in segmentation.trim_px does so as views arrive, and sooner",
     )
 
 

@@ -192,6 +192,8 @@ def _edges(
     to_edge = [pixels_to_edge(view, grain.pitch_m) for view in views]
     at_points = [near[s.index] for near, s in zip(to_edge, surfaces, strict=True)]
     px = fat_px(surfaces, poses, at_points, config, grain.pitch_m)
+    if not px:
+        return 0, []
     return px, [inside_edges(v, near, px) for v, near in zip(views, to_edge, strict=True)]
 
 

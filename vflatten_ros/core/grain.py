@@ -107,23 +107,24 @@ def notices_of(config: RotationConfig, grain: Grain, apart_m: float) -> tuple[No
     apart_m : float
         Standard deviation of overlapping views' surfaces from each other.
     """
+    notices = []
     if apart_m > SMOOTHED * grain.noise_m:
         text = (
             f"views differ by {1e3 * apart_m:.1f} mm where the points of one scatter by "
             f"{1e3 * grain.noise_m:.1f} mm only: filters that smooth the depth, or matching of "
             "large blocks, join layers; turn them off"
         )
-        return (Notice("smoothed_depth", text),)
+        notices.append(Notice("smoothed_depth", text))
     noise, pitch = _times(config, grain)
-    if noise <= TOLD_NOISE and pitch <= TOLD_PITCH:
-        return ()
-    text = (
-        f"the points scatter by {1e3 * grain.noise_m:.1f} mm and are {1e3 * grain.pitch_m:.1f} mm "
-        f"apart, the method is set for {SEEN_SHARE * 1e3 * config.noise_m:.1f} and "
-        f"{1e3 * config.pitch_m:.1f} mm: layers that hang close together may be taken for one; "
-        "hold the item nearer to the rig"
-    )
-    return (Notice("coarse_points", text),)
+    if noise > TOLD_NOISE or pitch > TOLD_PITCH:
+        text = (
+            f"the points scatter by {1e3 * grain.noise_m:.1f} mm and are "
+            f"{1e3 * grain.pitch_m:.1f} mm apart, the method is set for "
+            f"{SEEN_SHARE * 1e3 * config.noise_m:.1f} and {1e3 * config.pitch_m:.1f} mm: layers "
+            "that hang close together may be taken for one; hold the item nearer to the rig"
+        )
+        notices.append(Notice("coarse_points", text))
+    return tuple(notices)
 
 
 def too_noisy(config: RotationConfig, grain: Grain) -> str:

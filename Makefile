@@ -10,7 +10,7 @@ PYTHON ?= python3
 # Runs what follows in the built package's environment.
 IN_ENV := source env.sh;
 
-.PHONY: help bootstrap demo test check format bench bench-peers reproduce accuracy cameras docs lock clean
+.PHONY: help bootstrap demo test check format bench bench-peers reproduce accuracy cameras calibration docs lock clean
 
 help:  ## This list
 	@sed -nE 's/^([a-z-]+):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -48,6 +48,9 @@ accuracy: bootstrap  ## Errors over recordings with known sizes: docs/accuracy.m
 
 cameras: bootstrap  ## The same with other errors of depth, and an item that swings: docs/cameras.md
 	@$(IN_ENV) python benchmarks/cameras.py $(RECORDINGS) $(ARGS)
+
+calibration: bootstrap  ## How well a rotation of cloth tells the axis: the table of docs/calibration.md
+	@$(IN_ENV) python benchmarks/calibration.py $(RECORDINGS) $(ARGS)
 
 docs: bootstrap  ## Regenerate docs/parameters.md from the defaults in the code
 	@$(IN_ENV) python -m vflatten_ros.parameters > build/parameters.md; mv build/parameters.md docs/

@@ -177,7 +177,9 @@ def compare(folder: Path, run: str, pictures: Path) -> Row | None:
     return row
 
 
-def misplaced(folder: Path, scratch: Path) -> Path:
+def misplaced(
+    folder: Path, scratch: Path, shift_m: float = AXIS_SHIFT_M, tilt_rad: float = AXIS_TILT_RAD
+) -> Path:
     """A calibration whose axis is off; the direction of the error depends on the name alone."""
     values = yaml.safe_load((folder / "calibration.yaml").read_text(encoding="utf-8"))
     random = np.random.default_rng(list(folder.name.encode()))
@@ -185,8 +187,8 @@ def misplaced(folder: Path, scratch: Path) -> Path:
     side = np.cross(up, random.normal(size=3))
     side /= np.linalg.norm(side)
     for key in ("axis_point", "gripper_tip"):
-        values[key] = (np.array(values[key]) + AXIS_SHIFT_M * side).tolist()
-    values["axis_direction"] = (rotation_about(side, AXIS_TILT_RAD) @ up).tolist()
+        values[key] = (np.array(values[key]) + shift_m * side).tolist()
+    values["axis_direction"] = (rotation_about(side, tilt_rad) @ up).tolist()
     path = scratch / "calibration.yaml"
     path.write_text(yaml.safe_dump(values), encoding="utf-8")
     return path

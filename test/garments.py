@@ -122,6 +122,7 @@ def example_garment(views: list[View] | None = None) -> FlatGarment:
             Measurement("width", 0.30, 0.003, False, ((-0.15, -0.25), (0.15, -0.25))),
         ),
         landmarks=_landmarks(),
+        calibration=views[0].calibration,
         correspondences=_correspondences(views),
         coverage=0.93,
         quality=0.8,

@@ -26,6 +26,7 @@ from vflatten_ros.cli import main
 ROOT = Path(__file__).parent.parent
 BAG = ROOT / "bags" / "LS1_1"
 SHORTS = ROOT / "bags" / "SH1_1"
+SKIRT = ROOT / "bags" / "SK2_1"
 CLOUDS, JOINTS = "/rig/points", "/gripper/joint_states"
 START = [sys.executable, "-c", "import sys; from vflatten_ros.cli import main; sys.exit(main())"]
 
@@ -378,3 +379,48 @@ def test_a_terminal_gets_a_progress_bar():
     assert b"views" in shown
     last = shown.split(b"\r")[-2].strip()
     assert last.startswith(b"vflatten: "), "the bar is gone before the message"
+
+
+def test_calibrate_finds_the_axis_by_what_hangs_there(tmp_path):
+    """From a guess 5 cm and 4 degrees off, with the sign of the joint wrong."""
+    true = yaml.safe_load((SKIRT / "calibration.yaml").read_text())
+    guess = edited_calibration(
+        tmp_path,
+        **true
+        | {
+            "axis_point": np.add(true["axis_point"], [0.04, 0.0, 0.03]).tolist(),
+            "gripper_tip": np.add(true["gripper_tip"], [0.04, 0.0, 0.03]).tolist(),
+            "axis_direction": [0.05, -1.0, 0.03],
+            "joint_sign": -true["joint_sign"],
+        },
+    )
+    refused = vflatten("replay", SKIRT, "--calibration", guess)
+    assert refused.returncode == 1
+    assert f"set joint_sign to {true['joint_sign']}" in refused.stderr
+    found = tmp_path / "found" / "calibration.yaml"
+    run = vflatten("calibrate", SKIRT, "--calibration", guess, "--output", found)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+    values = yaml.safe_load(found.read_text())
+    assert {k: values[k] for k in ("frame", "joint", "joint_sign", "joint_zero")} == {
+        k: true[k] for k in ("frame", "joint", "joint_sign", "joint_zero")
+    }
+    up = np.array(true["axis_direction"])
+    lean = np.linalg.norm(np.cross(up, values["axis_direction"]))
+    away = np.cross(np.array(values["axis_point"]) - true["axis_point"], up)
+    assert lean < np.radians(0.15)
+    assert np.linalg.norm(away) < 0.0015
+    again = vflatten("calibrate", SKIRT, "--calibration", found)
+    said = re.match(
+        r"# By vflatten calibrate. The axis was (.*) mm and (.*) degrees off", again.stdout
+    )
+    assert float(said[1]) < 0.5
+    assert float(said[2]) < 0.05
+
+
+def test_calibrate_says_what_is_missing(tmp_path):
+    run = vflatten("calibrate", SKIRT, "--calibration", tmp_path / "none.yaml")
+    assert run.returncode == 1
+    assert "no such file; give one with --calibration" in run.stderr
+    run = vflatten("calibrate", BAG, "--output", tmp_path)
+    assert run.returncode == 1
+    assert "is a folder, expected a file" in run.stderr

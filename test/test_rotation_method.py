@@ -8,13 +8,14 @@ import json
 import cv2
 import numpy as np
 import pytest
+import yaml
 from recordings import BAGS
 
 from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core import fused, grain, grouping, parallel, pipeline, rotation, ways
+from vflatten_ros.core import fused, grain, grouping, parallel, pipeline, rotation, turning, ways
 from vflatten_ros.core.config import Config
-from vflatten_ros.core.errors import DisconnectedSurface
+from vflatten_ros.core.errors import DisconnectedSurface, InvalidCalibration
 from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.replay import replay_recording
 from vflatten_ros.results import garment_result, json_text
@@ -53,14 +54,13 @@ def askew_m(garment, folder):
     truth = json.loads((folder / "truth.json").read_text())["landmarks"]
     named = {mark.name: mark.uv for mark in garment.landmarks if mark.name in truth}
     true = np.array([truth[name]["flat"] for name in named])
-    swapped = np.array(
-        [
-            truth[name.replace("left", "#").replace("right", "left").replace("#", "right")]["flat"]
-            for name in named
-        ]
-    )
+    swapped = np.array([truth[_other_side(name)]["flat"] for name in named])
     off = [np.median(np.linalg.norm(list(named.values()) - x, axis=1)) for x in (true, swapped)]
     return float(min(off))
+
+
+def _other_side(name):
+    return name.replace("left", "#").replace("right", "left").replace("#", "right")
 
 
 def untrusted(garment):
@@ -279,3 +279,48 @@ def test_points_as_noisy_as_layers_are_thick_are_not_trusted(monkeypatch):
     monkeypatch.setattr(grain, "TRUSTED_NOISE", 0.9)
     garment = replay_recording(BAGS / "SK2_1", ALL_VIEWS).garment
     assert any("cannot be told apart" in n.text for n in garment.notices if n.code == "untrusted")
+
+
+@pytest.mark.slow
+def test_views_at_any_angles_fit_together_in_no_way():
+    """As with joint states in degrees: the result is not trusted, and no axis is found."""
+    rig = load_calibration(calibration_beside(BAGS / "SK2_1"))
+    views = gather_views(open_recording(BAGS / "SK2_1"), rig, ALL_VIEWS).views()
+    shuffled = np.random.default_rng(6).permutation([view.angle_rad for view in views])
+    pairs = zip(views, shuffled.tolist(), strict=True)
+    views = [dataclasses.replace(view, angle_rad=angle) for view, angle in pairs]
+    told = fused.fuse_views(views, ALL_VIEWS.rotation).notices
+    assert [notice.code for notice in told][:2] == ["views_misplaced", "untrusted"]
+    with pytest.raises(InvalidCalibration, match="do not fit together"):
+        turning.refine_axis(views, ALL_VIEWS.rotation)
+
+
+@pytest.mark.slow
+def test_an_axis_off_by_centimetres_changes_neither_sizes_nor_where_landmarks_are(tmp_path):
+    """Of the rig frame, in which a robot grasps."""
+    folder = BAGS / "SH1_1"
+    values = yaml.safe_load((folder / "calibration.yaml").read_text())
+    for key in ("axis_point", "gripper_tip"):
+        values[key] = np.add(values[key], [0.03, 0.0, 0.04]).tolist()
+    values["axis_direction"] = np.add(values["axis_direction"], [0.05, 0.0, -0.05]).tolist()
+    rough = tmp_path / "calibration.yaml"
+    rough.write_text(yaml.safe_dump(values))
+    garment = replay_recording(folder, ALL_VIEWS, calibration=rough).garment
+    category, wrong = errors(garment, folder)
+    assert garment.category == category
+    assert max(wrong) < 0.04
+    assert not untrusted(garment)
+    assert "axis_off" in {notice.code for notice in garment.notices}
+    true = json.loads((folder / "truth.json").read_text())
+    T = true["wrist_to_optical"]
+    known = true["landmarks"]
+    marks = {m.name: m.xyz_hanger for m in garment.landmarks if m.seen and m.name in known}
+    there = garment.calibration.T_rig_hanger(0.0)
+    mirrored = {name: _other_side(name) for name in known}
+    off = []
+    for naming in (dict(zip(marks, marks, strict=True)), mirrored):  # front and back look alike
+        hanging = [known[naming[name]]["hanging"] for name in marks]
+        places = np.array(hanging) @ np.array(T["R"]).T + T["t"]
+        shown = np.array(list(marks.values())) @ there[:3, :3].T + there[:3, 3]
+        off.append(float(np.median(np.linalg.norm(shown - places, axis=1))))
+    assert min(off) < 0.015

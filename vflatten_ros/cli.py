@@ -1,4 +1,4 @@
-"""The command `vflatten`: replay a recording, flatten one cloud, run the node, play a recording.
+"""The command `vflatten`: replay a recording, flatten one cloud, find the axis, run the node, play.
 
 Exit codes: 0 done, 1 failed (one line on stderr says why), 2 wrong usage, 130 interrupted.
 """
@@ -81,20 +81,12 @@ def _parser() -> argparse.ArgumentParser:
 
     replay = commands.add_parser("replay", help="flatten the item of a recorded rotation")
     replay.set_defaults(run=_replay)
-    replay.add_argument("recording", type=Path, help="rosbag2 folder or .mcap file")
     replay.add_argument(
         "--protocol", type=Path, metavar="FILE",
         help="views and corresponding points given by hand; method kita2019 unless told otherwise",
     )  # fmt: skip
     replay.add_argument("--views", type=_view_ids, metavar="I,J", help="use these views only")
-    replay.add_argument(
-        "--calibration",
-        type=Path,
-        metavar="FILE",
-        help="default: calibration.yaml of the recording",
-    )
-    replay.add_argument("--cloud-topic", metavar="TOPIC", help="default: the only one")
-    replay.add_argument("--joint-topic", metavar="TOPIC", help="default: the only one")
+    _add_recorded(replay)
     replay.add_argument(
         "--processes", type=int, choices=(1, 2), default=2,
         help="with 2 (default), one tries other ways of laying the item flat meanwhile (method "
@@ -114,9 +106,34 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_common(flatten)
 
+    calibrate = commands.add_parser(
+        "calibrate", help="find the wrist axis by a recorded rotation of any cloth"
+    )
+    calibrate.set_defaults(run=_calibrate, method=None)
+    _add_recorded(calibrate)
+    calibrate.add_argument(
+        "--config", type=Path, metavar="FILE", help="settings, as config/vflatten.yaml"
+    )
+    calibrate.add_argument(
+        "--output", type=Path, metavar="OUT", help="write the calibration there (default: print it)"
+    )
+    calibrate.add_argument("--quiet", action="store_true", help="no progress bar")
+
     commands.add_parser("node", help="run the live node (needs ROS 2); see vflatten node --help")
     commands.add_parser("play", help="publish a recording (needs ROS 2); see vflatten play --help")
     return parser
+
+
+def _add_recorded(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, help="rosbag2 folder or .mcap file")
+    parser.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="default: calibration.yaml of the recording",
+    )
+    parser.add_argument("--cloud-topic", metavar="TOPIC", help="default: the only one")
+    parser.add_argument("--joint-topic", metavar="TOPIC", help="default: the only one")
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
@@ -164,16 +181,44 @@ def _flatten(args: argparse.Namespace) -> None:
     _report(args, replayed, stages)
 
 
+def _calibrate(args: argparse.Namespace) -> None:
+    from vflatten_ros.calibrate import calibrate_recording, calibration_text
+    from vflatten_ros.output_files import whole_file
+
+    _make_room(args.output)
+    with Stages(_show_bar(args)) as stages:
+        axis = calibrate_recording(
+            args.recording,
+            _config(args, "rotation"),
+            calibration=args.calibration,
+            cloud_topic=args.cloud_topic,
+            joint_topic=args.joint_topic,
+            progress=stages,
+            warn=stages.warn,
+        )
+    text = calibration_text(axis)
+    if args.output is None:
+        print(text, end="")
+        return
+    with whole_file(args.output) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
 def _prepare_outputs(args: argparse.Namespace) -> None:
-    """Make the folders asked for: what cannot be written fails before the work, not after it."""
-    for path in filter(None, (args.json, args.mcap)):
+    """Make the folders asked for."""
+    _make_room(args.json, args.mcap)
+    if args.figures:
+        args.figures.mkdir(parents=True, exist_ok=True)
+
+
+def _make_room(*paths: Path | None) -> None:
+    """Folders of files: what cannot be written fails before the work, not after it."""
+    for path in filter(None, paths):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, "is a folder, expected a file", str(path))
         if not os.access(path.parent, os.W_OK):
             raise PermissionError(errno.EACCES, "cannot be written to", str(path.parent))
-    if args.figures:
-        args.figures.mkdir(parents=True, exist_ok=True)
 
 
 def _write(args: argparse.Namespace, replayed: Replayed, stages: Stages) -> None:

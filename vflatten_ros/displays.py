@@ -126,7 +126,7 @@ def _T_rig_hanger(garment: FlatGarment, views: Sequence[View]) -> Float:
     if not used:
         return np.eye(4)
     newest = max(used, key=lambda view: (view.stamp_ns, view.view_id))
-    return newest.calibration.T_rig_hanger(newest.angle_rad)
+    return garment.calibration.T_rig_hanger(newest.angle_rad)
 
 
 def _beside(garment: FlatGarment, views: Sequence[View], T_rig_hanger: Float) -> Any:

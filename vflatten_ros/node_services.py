@@ -201,8 +201,8 @@ class Services:
         unseen = f"no view shows {mark.name!r}; turn the item and flatten again"
         if mark.xyz_hanger is None:
             raise Refused(NOT_SEEN, unseen)
-        xyz = transform_points(session.calibration.T_rig_hanger(angle), np.array(mark.xyz_hanger))
-        frame = session.calibration.frame
+        xyz = transform_points(garment.calibration.T_rig_hanger(angle), np.array(mark.xyz_hanger))
+        frame = garment.calibration.frame
         if request.frame_id not in ("", frame):
             xyz = transform_points(self._node.frames.matrix(request.frame_id, frame), xyz)
             frame = request.frame_id

@@ -35,7 +35,7 @@ def garment_result(garment: FlatGarment, views: Sequence[View]) -> Result:
     return result_from_fields(
         flattened_view_fields(garment, views),
         garment_estimate_fields(garment, views),
-        views[0].calibration,
+        garment.calibration,
     )
 
 

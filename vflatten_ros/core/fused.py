@@ -26,7 +26,17 @@ from vflatten_ros.core.registration import (
 from vflatten_ros.core.sight import PlacedSight
 from vflatten_ros.core.slide import neighbours, slide_m
 from vflatten_ros.core.slide import notice_of as slide_notice
-from vflatten_ros.core.values import Correspondence, Float, Int, Notice, Progress, View, no_progress
+from vflatten_ros.core.turning import as_they_turn
+from vflatten_ros.core.values import (
+    Calibration,
+    Correspondence,
+    Float,
+    Int,
+    Notice,
+    Progress,
+    View,
+    no_progress,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +48,7 @@ class Fused:
     view_ids: Int  # (v,) of the points' views
     point_pixel: Int  # (m, 2)
     grain: Grain  # of the points, median of the views
+    calibration: Calibration | None = None  # of the hanger frame that they are in
     sights: tuple[PlacedSight, ...] = ()  # none: whether cloth goes on is told by the samples
     given: Judged = NOTHING_GIVEN  # corresponding points
     notices: tuple[Notice, ...] = ()
@@ -125,7 +136,17 @@ def fuse_views(
         for surface, pose in zip(surfaces, poses, strict=True)
         if surface.sight is not None
     )
-    return Fused(samples, points, view_ids, point_pixel, grain, sights, checked, notices)
+    return Fused(
+        samples,
+        points,
+        view_ids,
+        point_pixel,
+        grain,
+        registered.calibration,
+        sights,
+        checked,
+        notices,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +154,7 @@ class _Registered:
     surfaces: Sequence[ViewSurface]
     poses: Sequence[Float]  # (4, 4) each: takes its hanger coordinates to the common ones
     apart_m: float  # of the surfaces of overlapping views
+    calibration: Calibration  # that has the axis about which they turn
     notices: tuple[Notice, ...] = ()
 
 
@@ -144,7 +166,7 @@ def _registered(
     features: bool,
     so_far: Folded | None,
 ) -> _Registered:
-    """Surface and pose of each view.
+    """Surface and pose of each view, in the hanger frame of the axis about which they turn.
 
     Anew, where together they tell of fat edges, or of more noise than any one of them shows.
     """
@@ -158,11 +180,13 @@ def _registered(
             return view_surface(view, config, features, noise_m)
 
         surfaces = _each(surface_again, seen, progress)
-        placed = Folded(tuple(surfaces), tuple(poses), config)
-        return surfaces, register_views(surfaces, config, progress, placed)
+        placed = Folded(tuple(surfaces), tuple(poses), turned.config)
+        return surfaces, register_views(surfaces, turned.config, progress, placed)
 
     surfaces = _each(surface, seen, progress)
     poses = register_views(surfaces, config, progress, so_far)
+    turned = as_they_turn(views, surfaces, poses, config, progress)
+    poses = turned.poses
     grain, apart_m = _told_by_all(surfaces, poses, config)
     px, within = _edges(views, surfaces, poses, config, grain)
     if px:
@@ -176,7 +200,9 @@ def _registered(
     if rows is not None:
         pairs = zip(surfaces, rows, strict=True)
         surfaces = [replace(surface, index=kept[surface.index]) for surface, kept in pairs]
-    return _Registered(surfaces, poses, apart_m, notices)
+    notices = turned.notices + notices
+    poses = [turned.T_hanger_common @ pose for pose in poses]
+    return _Registered(surfaces, poses, apart_m, turned.calibration, notices)
 
 
 def _edges(

@@ -163,6 +163,7 @@ def _rotation(
     given, told = fused.given, fused.notices + fused.given.notices
     best = likeliest(fused, tuple(templates), config, progress, helper)
     config = replace(config, rotation=best.rotation)
+    calibration = fused.calibration
     del fused  # its points are many
     unfolded, found = best.unfolded, best.found
     turn, turns = 0, TURNS if found.category != UNKNOWN else 0
@@ -205,6 +206,7 @@ def _rotation(
         correspondences=given.used,
         notices=notices,
         seen=coverage(unfolded.surface, views),
+        calibration=calibration,
         outline_sigma_m=float(np.hypot(config.rotation.outline_sigma_m, placed_m)),
     )
     return flattened, found
@@ -263,6 +265,7 @@ def _described(
         correspondences=flattened.correspondences,
         coverage=measured.coverage,
         quality=measured.quality,
+        calibration=flattened.calibration or views[0].calibration,
         notices=flattened.notices + tuple(n for n in measured.notices if n.code not in told),
     )
     if recognition.fit is not None and recognition.category != UNKNOWN:

@@ -20,10 +20,20 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.features import NO_FEATURES, Features, features_of
-from vflatten_ros.core.geometry import Float, inverse, rigid, rotation_about, transform_points
+from vflatten_ros.core.geometry import Float, inverse, transform_points
 from vflatten_ros.core.grain import Grain, grain_of, suited, typical
+from vflatten_ros.core.motions import (
+    AXIS,
+    axis_error,
+    axis_information,
+    effect,
+    own_information,
+    parameters,
+    stepped,
+)
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.sight import Sight, sight_of
+from vflatten_ros.core.turntable import TURN
 from vflatten_ros.core.values import Int, Progress, View, no_progress
 
 MIN_POINTS = 100  # a view with fewer item points shows nothing that could be placed
@@ -32,7 +42,12 @@ MOST_PARTNERS = 4  # on either side of a view
 FOLD_ROUNDS = 3  # of placing one view by those before it
 SETTLED = 2e-5  # step, metres and radians, far below the noise
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution, in median deviations
-AXIS = 4  # numbers of the axis error: two of its lean, two of its place
+FEWEST_PAIRS, FAR_DEG = 3, 50.0  # of neighbouring views, for them to tell whether they fit
+NEAR_DEG, LEAST_NEAR, LEAST_FAR = 31.0, 0.7, 0.5  # share on itself of views apart up to so much,
+# and up to FAR_DEG; the least seen was 0.73 and 0.58, the most of views wrongly turned 0.60, 0.32
+SAME = 3.0  # standard deviations of the noise, within which points lie on a surface
+HOPELESS = 0.6  # of the least; errors of depth that neighbouring points share halve what agrees
+PLAINLY = 1.5  # times as much lies on itself one way, for it not to be the other
 NEIGHBOURS, RADIUS_M, LEAST = 24, 0.012, 8  # most points of a plane of this radius, and fewest
 
 
@@ -154,8 +169,8 @@ def _placed_by(
 ) -> Float:
     """Pose of a view by those before it, which stay: the axis as they have it, then the surface."""
     config = suited(config, new.grain)
-    guess = _effect(new) @ _axis_error(before, poses, config)
-    pose = _moved(np.eye(4), guess)
+    guess = effect(new.angle_rad) @ axis_error([s.angle_rad for s in before], poses, config)
+    pose = stepped(np.eye(4), guess)
     everyone = [*before, new]
     pairs = _overlapping([s.angle_rad for s in everyone], config.overlap_deg)
     partners = [i for i, j in pairs if j == len(before)]
@@ -163,14 +178,14 @@ def _placed_by(
         i: _seen_from(before[i], _thinned(before[i], config.register_points), poses[i])
         for i in partners
     }
-    own = _own_information(config)
+    own = own_information(config)
     for _ in range(FOLD_ROUNDS):
-        off = _parameters([pose])
+        off = parameters([pose])
         normal, gradient = np.diag(own), own * (off - guess)
         for _, block, slope in _equations(moved, config, (partners, new, pose)):
             normal, gradient = normal + block, gradient - slope
         step = -np.linalg.solve(normal, gradient)
-        pose = _moved(pose, step)
+        pose = stepped(pose, step)
         if np.abs(step).max() < SETTLED:
             break
     return pose
@@ -215,14 +230,14 @@ def register_views(
         progress("register", done / config.register_rounds)
         placed = zip(surfaces, thin, poses, strict=True)
         moved = {i: _seen_from(*each) for i, each in enumerate(placed)}
-        off = np.r_[_parameters(poses), np.zeros(AXIS)]  # the axis error is solved anew
+        off = np.r_[parameters(poses), np.zeros(AXIS)]  # the axis error is solved anew
         normal, gradient = prior.copy(), prior @ off
         equations = partial(_equations, moved, config)
         for j, found in enumerate(mapped(equations, zip(partners, surfaces, poses, strict=True))):
             for i, block, slope in found:
                 _add_pair(normal, gradient, i, j, block, slope)
         step = -np.linalg.solve(normal, gradient)[: 6 * len(poses)].reshape(-1, 6)
-        poses = [_moved(pose, change) for pose, change in zip(poses, step, strict=True)]
+        poses = [stepped(pose, change) for pose, change in zip(poses, step, strict=True)]
         if np.abs(step).max() < SETTLED:
             break
     return poses
@@ -264,6 +279,62 @@ def disagreement_m(
     return float(NORMAL_MAD * np.median(np.abs(found))) if len(found) else 0.0
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """How much of the cloth that neighbouring views show lies on itself."""
+
+    share: float  # 0-1, of one view's points; those that the next one does not show included
+    least: float  # of views that were placed rightly
+
+    @property
+    def enough(self) -> bool:
+        """Whether the views fit together beyond doubt."""
+        return self.share >= self.least
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether they do not, however noisy they are."""
+        return self.share < HOPELESS * self.least
+
+    def plainly_more_than(self, other: Agreement) -> bool:
+        """Whether this is how the views are to be placed, and not the other way."""
+        return not self.hopeless and self.share > PLAINLY * other.share
+
+
+def agreement(
+    surfaces: Sequence[ViewSurface], poses: Sequence[Float], config: RotationConfig
+) -> Agreement:
+    """Whether registered views fit together.
+
+    Parameters
+    ----------
+    surfaces : sequence of ViewSurface
+    poses : sequence of ndarray of shape (4, 4)
+        Of these.
+    config : RotationConfig
+
+    Returns
+    -------
+    Agreement
+        Enough if hardly any two views are near enough in angle to tell.
+    """
+    config = suited(config, typical([surface.grain for surface in surfaces]))
+    angles = np.array([surface.angle_rad for surface in surfaces])
+    order = np.argsort(angles % TURN, kind="stable")
+    after = np.roll(order, -1)
+    steps = (angles[after] - angles[order]) % TURN
+    shares = []
+    for i, j in zip(order[steps <= np.radians(FAR_DEG)], after[steps <= np.radians(FAR_DEG)]):
+        rows = _thinned(surfaces[i], config.register_points)
+        seen = {int(i): _seen_from(surfaces[i], rows, poses[i])}
+        found = _residuals(seen, config, ([int(i)], surfaces[j], poses[j]))
+        shares.append((np.abs(found.error) < SAME * config.noise_m).sum() / len(rows))
+    if len(shares) < FEWEST_PAIRS:
+        return Agreement(1.0, 0.0)
+    near = np.median(steps[steps <= np.radians(FAR_DEG)]) <= np.radians(NEAR_DEG)
+    return Agreement(float(np.mean(shares)), LEAST_NEAR if near else LEAST_FAR)
+
+
 def _partners(surfaces: Sequence[ViewSurface], config: RotationConfig) -> list[list[int]]:
     """Of each view, those that see the same cloth."""
     pairs = _overlapping([s.angle_rad for s in surfaces], config.overlap_deg)
@@ -300,56 +371,14 @@ def _prior(surfaces: Sequence[ViewSurface], config: RotationConfig) -> Float:
 
     Each view's own motion is what is left after that.
     """
-    n, own = len(surfaces), _own_information(config)
+    n, own = len(surfaces), own_information(config)
     information = np.zeros((6 * n + AXIS, 6 * n + AXIS))
-    information[6 * n :, 6 * n :] = np.diag(_axis_information(config))
+    information[6 * n :, 6 * n :] = np.diag(axis_information(config))
     for k, surface in enumerate(surfaces):
         row = np.zeros((6, len(information)))
-        row[:, 6 * k : 6 * k + 6], row[:, 6 * n :] = np.eye(6), -_effect(surface)
+        row[:, 6 * k : 6 * k + 6], row[:, 6 * n :] = np.eye(6), -effect(surface.angle_rad)
         information += row.T @ (own[:, None] * row)
     return information
-
-
-def _own_information(config: RotationConfig) -> Float:
-    """(6,) of a view's rotation vector and shift."""
-    return 1 / np.array([np.radians(config.lag_deg)] * 3 + [config.sway_m] * 3) ** 2
-
-
-def _axis_information(config: RotationConfig) -> Float:
-    """(4,) of the axis error: how it leans and where it is, at angle 0."""
-    return 1 / np.array([np.radians(config.axis_deg)] * 2 + [config.axis_m] * 2) ** 2
-
-
-def _effect(surface: ViewSurface) -> Float:
-    """(6, 4) motion of a view by the axis error: one at angle a sees it turned by -a."""
-    back = rotation_about(np.array([0.0, 0.0, 1.0]), -surface.angle_rad)[:, :2]
-    effect = np.zeros((6, AXIS))
-    effect[:3, :2], effect[3:, 2:] = back, back
-    return effect
-
-
-def _axis_error(
-    surfaces: Sequence[ViewSurface], poses: Sequence[Float], config: RotationConfig
-) -> Float:
-    """(4,) axis error that the views' poses tell of."""
-    own, right = _own_information(config), np.zeros(AXIS)
-    normal = np.diag(_axis_information(config))
-    for surface, pose in zip(surfaces, poses, strict=True):
-        effect = _effect(surface)
-        normal += effect.T @ (own[:, None] * effect)
-        right += effect.T @ (own * _parameters([pose]))
-    error: Float = np.linalg.solve(normal, right)
-    return error
-
-
-def _parameters(poses: Sequence[Float]) -> Float:
-    """(6n,) rotation vector and shift of each pose."""
-    flat = np.zeros(6 * len(poses))
-    for k, pose in enumerate(poses):
-        skew = (pose[:3, :3] - pose[:3, :3].T) / 2  # corrections are a degree or two at most
-        flat[6 * k : 6 * k + 3] = skew[2, 1], skew[0, 2], skew[1, 0]
-        flat[6 * k + 3 : 6 * k + 6] = pose[:3, 3]
-    return flat
 
 
 def _seen_from(surface: ViewSurface, rows: Int, pose: Float) -> tuple[Float, Float]:
@@ -435,10 +464,3 @@ def _add_pair(normal: Float, gradient: Float, i: int, j: int, block: Float, slop
     normal[at_j, at_i] -= block
     gradient[at_i] += slope
     gradient[at_j] -= slope
-
-
-def _moved(pose: Float, change: Float) -> Float:
-    """A pose followed by a small rotation and shift."""
-    angle = float(np.linalg.norm(change[:3]))
-    axis = change[:3] / angle if angle > 1e-12 else np.array([0.0, 0.0, 1.0])
-    return rigid(rotation_about(axis, angle), change[3:]) @ pose

@@ -234,6 +234,7 @@ class Flattened:
     )  # the largest is the outline's; others are loose
     seen: Coverage | None = None  # None: not known
     outline_sigma_m: float = 0.0  # error that a whole edge shares, beside that of its points
+    calibration: Calibration | None = None  # of the hanger frame; None: that of the views
 
 
 @dataclass(frozen=True)
@@ -288,7 +289,8 @@ NOTICE_CODES: Mapping[str, str] = {
     "coarse_points": "the points are noisier, or farther apart, than the method is set for",
     "smoothed_depth": "the depth was smoothed over, which joins layers: turn its filters off",
     "fat_edges": "stereo has made edges wider: what it added was taken off",
-    "views_misplaced": "a print on the cloth contradicts the registration of the views",
+    "views_misplaced": "the views do not fit together, or a print on the cloth says so",
+    "axis_off": "the item turned about another axis than the calibration has",
     "views_chosen": "which views the two-view method chose by itself",
     "high_stress": "the distances contradict each other more than noise explains",
     "unseen": "no view shows some cloth that matters: turn, or grasp elsewhere",
@@ -319,6 +321,7 @@ class FlatGarment:
     correspondences: tuple[Correspondence, ...]
     coverage: float  # 0-1, share of the template's area that was seen
     quality: float  # 0-1, higher is better
+    calibration: Calibration  # of the hanger frame: the axis about which the item turned
     notices: tuple[Notice, ...] = field(default=())
     shares: tuple[ViewShare, ...] = ()  # by view_id; empty: not known
     unseen: Unseen | None = None  # None: nothing that matters

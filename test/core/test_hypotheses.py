@@ -32,6 +32,7 @@ def tried(
     parts=1,
     dent_m=0.0,
     doubled=None,
+    hidden=0.0,
 ):
     """A towel of 0.4 x 0.4 m, or what is said of it; its upper edge may lie further in.
 
@@ -42,7 +43,8 @@ def tried(
     uv = np.vstack([a + share_ * (b - a) for a, b in zip(square, np.roll(square, -1, axis=0))])
     uv = np.minimum(uv, [0.4, 0.4 - dent_m])
     outline = SimpleNamespace(uv=uv, inferred=np.arange(100) < 100 * unseen)
-    points = lying_at(np.random.default_rng(0).uniform(0.0, 0.4, (1000, 2)))
+    low = [0.4 * hidden, 0.0]
+    points = lying_at(np.random.default_rng(0).uniform(low, 0.4, (1000, 2)))
     points.stress[:] = np.where(np.arange(1000) < 1000 * strain, 0.002, 0.0005)
     on_others = np.argsort(points.uv[:, 0])[: round(1000 * (doubled or 0.0))]
     points.xyz_hanger[on_others, 2] = 0.1 * np.arange(len(on_others))
@@ -91,6 +93,20 @@ def test_an_item_of_which_much_was_not_seen_is_worse():
     assert tried(unseen=0.19).badness == tried().badness
     assert tried(unseen=0.6).badness == pytest.approx(tried().badness + 1.6)
     assert tried(unseen=0.6).untrusted and not tried(unseen=0.25).untrusted
+
+
+def test_cloth_that_is_hidden_between_parts_counts_and_makes_sizes_uncertain():
+    """In one part nothing is hidden inside the outline: what is missing there is told otherwise."""
+    whole, little, much = (tried(parts=2, hidden=share) for share in (0.0, 0.08, 0.3))
+    assert tried(hidden=0.3).badness == whole.badness == little.badness
+    assert much.badness > whole.badness + 0.5
+    assert much.hidden == pytest.approx(0.3, abs=0.05)
+    assert tried(hidden=0.3).apart_sigma_m == 0.0
+    assert whole.apart_sigma_m < 0.005  # points that lie at random leave gaps
+    assert little.apart_sigma_m == pytest.approx(0.35 * 0.4 * little.hidden)
+    assert 0.01 < little.apart_sigma_m < 0.4 * much.apart_sigma_m
+    fold = tried(parts=2, doubled=0.0).apart_sigma_m  # of a single sheet
+    assert fold == pytest.approx(np.hypot(0.03, whole.apart_sigma_m))
 
 
 def test_a_single_sheet_lies_on_no_other_cloth_of_its_own():
@@ -448,7 +464,7 @@ def test_groups_that_lie_like_a_skirt_and_are_legs_are_none(monkeypatch, legs):
     monkeypatch.setattr(ways, "turned_over", lambda *_: [])
     monkeypatch.setattr(ways, "put_beside", lambda *_: "beside")
     monkeypatch.setattr(ways, "axes_of", lambda *_: ())
-    monkeypatch.setattr(ways, "parted", lambda *_: "parted" if legs else None)
+    monkeypatch.setattr(ways, "parted", lambda *_: ("parted", 0.9) if legs else None)
     monkeypatch.setattr(ways, "_recognised", recognised)
     draw = ways._Draw(ways.Task(0, tuple(known.values()), Config()), 0, lambda *_: None)
     grouped = SimpleNamespace(masks=(np.ones(9, dtype=bool), np.ones(9, dtype=bool)))

@@ -19,7 +19,12 @@ from vflatten_ros.core.sheets import Links
 from vflatten_ros.core.slits import torn
 from vflatten_ros.core.values import Bool, Float, Int
 
-EVIDENT = 15.0  # log odds of a slit against what lies beside
+EVIDENT, SCALE = (
+    15.0,
+    2.0,
+)  # log odds of a slit against what lies beside, as likely as not: the best
+# of many lines; and what of these is worth one
+LEAST = 0.02  # probability that is told
 SHORTEST_M = 0.05
 LONGEST = 0.65  # of the item
 OFF_MIDDLE = 0.07  # of the item's width
@@ -36,6 +41,14 @@ FEW = 5  # nearest pairs across the slit in a step along it
 FINE_M = 0.002  # between points along a slit
 
 Signs = tuple[Float, Float]  # points that are one, and all samples at which one could be
+
+
+@dataclass(frozen=True, eq=False)
+class Slit:
+    """Where a slit may lead into the middle of an item."""
+
+    line: Float  # (2, 2) its mouth and its end, m
+    probability: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +100,8 @@ def middle_slit(
     links: Links,
     axes: Sequence[Axis],
     config: RotationConfig,
-) -> Float | None:
-    """Where a slit leads into the middle of an item, if one does.
+) -> Slit | None:
+    """Where a slit may lead into the middle of an item; None: hardly any does.
 
     Parameters
     ----------
@@ -99,8 +112,7 @@ def middle_slit(
 
     Returns
     -------
-    ndarray of shape (2, 2) or None
-        Its mouth and its end, m.
+    Slit or None
     """
     a, b = links.a[links.rim], links.b[links.rim]
     folded = side[a] * side[b] < 0
@@ -109,10 +121,11 @@ def middle_slit(
     tears = [((uv[i] + uv[j])[side[i] == up] / 2, uv[side == up]) for up in (-1.0, 1.0)]
     found = [_likeliest(folds, tears, axis, config.spacing_m) for axis in axes]
     odds, line = max(found, key=lambda one: one[0])
-    if odds <= EVIDENT:
+    probability = float(1.0 / (1.0 + np.exp((EVIDENT - odds) / SCALE)))
+    if probability < LEAST:
         return None
     signs = np.vstack([folds[0], *(face[0] for face in tears)])
-    return _through(signs, line, REACH * ACROSS * config.spacing_m)
+    return Slit(_through(signs, line, REACH * ACROSS * config.spacing_m), probability)
 
 
 def banks_of(uv: Float, slit: Float, config: RotationConfig) -> Banks:

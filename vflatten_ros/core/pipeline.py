@@ -207,7 +207,9 @@ def _rotation(
         notices=notices,
         seen=coverage(unfolded.surface, views),
         calibration=calibration,
-        outline_sigma_m=float(np.hypot(config.rotation.outline_sigma_m, placed_m)),
+        outline_sigma_m=float(
+            np.linalg.norm([config.rotation.outline_sigma_m, placed_m, best.apart_sigma_m])
+        ),
     )
     return flattened, found
 

@@ -92,18 +92,24 @@ def recognise(
     scores = model_image_scores(evidence.outline, templates, config.decay, config.model_rotations)
     fits = fit_templates(templates, evidence, config, progress, begin)
     probabilities = _probabilities(fits, evidence, points, config)
+    none = np.zeros((0, 2))
+    of_none = Recognition("", scores, {}, None, none, np.zeros(0, dtype=bool), fits)
+    return likeliest_of(of_none, probabilities)
+
+
+def likeliest_of(found: Recognition, probabilities: Mapping[str, float]) -> Recognition:
+    """The same fits with other probabilities: the category is the likeliest."""
     category = max(probabilities, key=lambda name: probabilities[name])
     known = {name: p for name, p in probabilities.items() if name != UNKNOWN}
-    fit = fits[max(known, key=lambda name: known[name])]
+    fit = found.fits[max(known, key=lambda name: known[name])]
     k = fit.template.vertices if category != UNKNOWN else 0
-    return Recognition(
+    return replace(
+        found,
         category=category,
-        scores=scores,
         probabilities=probabilities,
         fit=fit,
         template_uv=fit.points()[:k],
         template_seen=fit.vertex_seen()[:k],
-        fits=fits,
     )
 
 

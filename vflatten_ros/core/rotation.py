@@ -236,8 +236,10 @@ def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationCo
     return together(parts, planes, turned, [one.side for one in parts], config, rest)
 
 
-def parted(unfolded: Unfolded, axes: Sequence[Axis], config: RotationConfig) -> Unfolded | None:
-    """The same surface with the slit that leads up its middle; None: it has none.
+def parted(
+    unfolded: Unfolded, axes: Sequence[Axis], config: RotationConfig
+) -> tuple[Unfolded, float] | None:
+    """The same surface with a slit that leads up its middle; None: it hardly has one.
 
     Parameters
     ----------
@@ -248,20 +250,21 @@ def parted(unfolded: Unfolded, axes: Sequence[Axis], config: RotationConfig) -> 
 
     Returns
     -------
-    Unfolded or None
-        Its outline goes in and out of the slit, and will when it is laid out anew.
+    (Unfolded, float) or None
+        Its outline goes in and out of the slit, and will when it is laid out anew; and the
+        probability that there is one.
     """
     surface, row, points, side = unfolded.surface, unfolded.row, unfolded.points, unfolded.side
     edge, links = _as_laid(surface, row, points.uv)
     slit = middle_slit(points.uv, side, edge, links, axes, config)
     if slit is None:
         return None
-    laid, count = banks_of(points.uv, slit, config), len(surface.edge)
+    laid, count = banks_of(points.uv, slit.line, config), len(surface.edge)
     banks = Banks(np.zeros(count, dtype=np.int64), np.zeros(count))
     banks.side[row], banks.along_m[row] = laid.side, laid.along_m
     surface = replace(surface, banks=banks)
     outline = _outline(surface, row, points, side, unfolded.firm, config)
-    return replace(unfolded, surface=surface, outline=outline)
+    return replace(unfolded, surface=surface, outline=outline), slit.probability
 
 
 def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Surface:

@@ -6,7 +6,7 @@ then lies flat, and is one of a kind that exists, can.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold
 from vflatten_ros.core.middle_slit import axes_of
 from vflatten_ros.core.necks import cut_at_neck
 from vflatten_ros.core.placing import Group, place_groups, turned_over
-from vflatten_ros.core.recognition import UNKNOWN, Recognition, recognise
+from vflatten_ros.core.recognition import UNKNOWN, Recognition, likeliest_of, recognise
 from vflatten_ros.core.rotation import (
     Surface,
     Unfolded,
@@ -168,7 +168,8 @@ class _Draw:
                 laid, placing.motions, placing.outline, sigma_m, turned, config.rotation
             )
             axes = axes_of(placing.outline, placing.pose)
-            if _like_legs(placing.template) and parted(beside, axes, config.rotation) is not None:
+            cut = parted(beside, axes, config.rotation) if _like_legs(placing.template) else None
+            if cut is not None and cut[1] > 0.5:
                 del odds[placing.template.category]  # the groups are legs
             else:
                 placed.append((placing, beside))
@@ -198,6 +199,21 @@ def _like_legs(template: Template) -> bool:
     return not template.parts and not template.single_sheet
 
 
+def _slit_or_not(
+    whole: Recognition, cut: Recognition, chance: float, templates: Sequence[Template]
+) -> dict[str, float]:
+    """Probabilities of the categories where an item has, by chance, a slit up its middle.
+
+    Then it has legs, whatever else it looks like.
+    """
+    legs = [t.category for t in templates if t.parts]
+    all_legs = max(sum(cut.probabilities[name] for name in legs), 1e-9)
+    told = {name: (1.0 - chance) * p for name, p in whole.probabilities.items()}
+    for name in legs:
+        told[name] += chance * cut.probabilities[name] / all_legs
+    return {name: p / sum(told.values()) for name, p in told.items()}
+
+
 def _recognised(
     unfolded: Unfolded,
     templates: tuple[Template, ...],
@@ -214,5 +230,9 @@ def _recognised(
         axes = axes_of(fit.points()[: fit.template.vertices], fit.pose)
         cut = parted(unfolded, axes, config.rotation)  # are these legs?
         if cut is not None:
-            unfolded, found = cut, named(cut)
+            legs, chance = named(cut[0]), cut[1]
+            told = _slit_or_not(found, legs, chance, templates)
+            if chance > 0.5:
+                unfolded, found = cut[0], legs
+            found = likeliest_of(found, told)
     return Tried(unfolded, found, rotation=config.rotation)

@@ -45,7 +45,7 @@ OFF = ((0.0, 0.0), (0.003, 0.5), (0.012, 2.0), (0.025, 4.0), (0.05, 8.0), (0.1, 
 INTRO = """Written by `benchmarks/calibration.py`; do not edit. {count} simulated recordings
 ({names}), each with its axis shifted and leaning another way. Left: how far the axis
 of `vflatten calibrate` is from the true one, with the joint's sign right and wrong. Right: the item
-flattened with the axis that is off and no calibration, all views and no manual input; landmarks are
+flattened with the axis that is off, not calibrated, all views and no manual input; landmarks are
 where they hang in the frame of the clouds.
 """
 
@@ -98,7 +98,7 @@ def tried(folder: Path, off: tuple[float, float]) -> Found:
         axes = []
         for sign in (1, -1):
             path.write_text(yaml.safe_dump(values | {"joint_sign": sign * true.joint_sign}))
-            axes.append(calibrate_recording(folder, config, calibration=path).calibration)
+            axes.append(calibrate_recording(folder, config, calibration=path).axis.calibration)
     return Found(
         off,
         tuple(apart(true, axis) for axis in axes),

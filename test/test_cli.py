@@ -398,8 +398,10 @@ def test_calibrate_finds_the_axis_by_what_hangs_there(tmp_path):
     assert refused.returncode == 1
     assert f"set joint_sign to {true['joint_sign']}" in refused.stderr
     found = tmp_path / "found" / "calibration.yaml"
-    run = vflatten("calibrate", SKIRT, "--calibration", guess, "--output", found)
+    wanted = ["--output", found, "--figures", tmp_path]
+    run = vflatten("calibrate", SKIRT, "--calibration", guess, *wanted)
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+    assert (tmp_path / "axis.png").stat().st_size > 10_000
     values = yaml.safe_load(found.read_text())
     assert {k: values[k] for k in ("frame", "joint", "joint_sign", "joint_zero")} == {
         k: true[k] for k in ("frame", "joint", "joint_sign", "joint_zero")

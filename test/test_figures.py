@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from garments import example_garment, example_views
+from garments import CALIBRATION, example_garment, example_views
 
 from vflatten_ros import figures
 from vflatten_ros.categories import load_templates
@@ -34,6 +34,21 @@ def test_all_figures_are_drawn(tmp_path, monkeypatch):
     assert found["views"]["vermilion"]  # letters
     assert found["geodesics"]["vermilion"] and found["geodesics"]["orange"]  # one line is flagged
     assert found["flattening"]["vermilion"]  # W and L
+
+
+def test_a_slice_of_the_cloth_shows_how_well_the_axis_fits(tmp_path, monkeypatch):
+    """One panel by either calibration; with the wrong sign the cloth lies elsewhere."""
+    shown = []
+    monkeypatch.setattr(figures, "draw_slice", lambda ax, views: shown.append(views))
+    given = replace(CALIBRATION, joint_sign=-CALIBRATION.joint_sign)
+    figures.draw_axis(given, VIEWS, tmp_path / "axis.png")
+    before, after = shown
+    assert [v.angle_rad for v in before] == [-v.angle_rad for v in VIEWS]
+    assert {v.calibration for v in before} == {given}
+    assert after == VIEWS
+    monkeypatch.undo()
+    figures.draw_axis(CALIBRATION, VIEWS, tmp_path / "axis.png")
+    assert cv2.imread(str(tmp_path / "axis.png")).shape[1] > 1000
 
 
 def without_everything():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,20 @@ import yaml
 from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.turning import Axis, apart, refine_axis
-from vflatten_ros.core.values import Progress, no_progress
+from vflatten_ros.core.values import Calibration, Progress, View, no_progress
 from vflatten_ros.files import calibration_beside, load_calibration
 
 SETTLED_M, SETTLED_RAD = 0.002, np.radians(0.2)  # by which the item is cut out of the clouds alike
 TIMES = 3  # of cutting it out, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """An axis, and what it was found by."""
+
+    axis: Axis
+    given: Calibration
+    views: tuple[View, ...]  # by the axis
 
 
 def calibrate_recording(
@@ -28,7 +37,7 @@ def calibrate_recording(
     joint_topic: str | None = None,
     progress: Progress = no_progress,
     warn: Callable[[str], None] = lambda text: None,
-) -> Axis:
+) -> Calibrated:
     """The calibration of a rig, by any cloth that hung still while it was turned.
 
     Parameters
@@ -62,7 +71,10 @@ def calibrate_recording(
     moved_m, leaned_rad = apart(given, rig)
     for text in dict.fromkeys(recording.warnings):
         warn(text)
-    return replace(found, moved_m=moved_m, leaned_rad=leaned_rad)
+    axis = replace(found, moved_m=moved_m, leaned_rad=leaned_rad)
+    turned = rig.joint_sign * views[0].calibration.joint_sign  # the sign may have been found last
+    by_axis = (replace(v, calibration=rig, angle_rad=turned * v.angle_rad) for v in views)
+    return Calibrated(axis, given, tuple(by_axis))
 
 
 def calibration_text(axis: Axis) -> str:

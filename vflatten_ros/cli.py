@@ -117,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--output", type=Path, metavar="OUT", help="write the calibration there (default: print it)"
     )
+    calibrate.add_argument("--figures", type=Path, metavar="DIR", help="draw axis.png")
     calibrate.add_argument("--quiet", action="store_true", help="no progress bar")
 
     commands.add_parser("node", help="run the live node (needs ROS 2); see vflatten node --help")
@@ -185,9 +186,9 @@ def _calibrate(args: argparse.Namespace) -> None:
     from vflatten_ros.calibrate import calibrate_recording, calibration_text
     from vflatten_ros.output_files import whole_file
 
-    _make_room(args.output)
+    _make_room(args.output, args.figures / "axis.png" if args.figures else None)
     with Stages(_show_bar(args)) as stages:
-        axis = calibrate_recording(
+        found = calibrate_recording(
             args.recording,
             _config(args, "rotation"),
             calibration=args.calibration,
@@ -196,7 +197,12 @@ def _calibrate(args: argparse.Namespace) -> None:
             progress=stages,
             warn=stages.warn,
         )
-    text = calibration_text(axis)
+        if args.figures:
+            from vflatten_ros.figures import draw_axis
+
+            stages("figures", 0.0)
+            draw_axis(found.given, found.views, args.figures / "axis.png")
+    text = calibration_text(found.axis)
     if args.output is None:
         print(text, end="")
         return

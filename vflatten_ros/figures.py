@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vflatten_ros.core.templates import Template
-from vflatten_ros.core.values import FlatGarment, View
+from vflatten_ros.core.values import Calibration, FlatGarment, View
 from vflatten_ros.plots import (
     CM,
     VIEW_COLOURS,
@@ -19,6 +20,7 @@ from vflatten_ros.plots import (
     draw_cloth,
     draw_dots,
     draw_flat,
+    draw_slice,
     draw_stress,
     draw_view,
     legend,
@@ -69,6 +71,29 @@ def draw_figures(
         paths.append(folder / f"{name}.png")
         figure.savefig(paths[-1], dpi=DPI, metadata={"Software": None})
     return paths
+
+
+def draw_axis(given: Calibration, views: Sequence[View], path: Path) -> None:
+    """Write a picture of all views' cloth at one height, by two calibrations, from above.
+
+    Parameters
+    ----------
+    given : Calibration
+        The one that was given.
+    views : sequence of View
+        With the one that was found.
+    path : Path
+    """
+    reverse = given.joint_sign * views[0].calibration.joint_sign
+    before = [
+        replace(view, calibration=given, angle_rad=reverse * view.angle_rad) for view in views
+    ]
+    figure = Figure(figsize=(11.0, 5.6), layout="constrained")
+    for ax, name, shown in zip(_row(figure, 2), ("given", "found"), (before, views), strict=True):
+        draw_slice(ax, shown)
+        ax.set_title(f"the axis as {name}")
+    figure.suptitle("Cloth of all views at one height, from above; a colour for each view")
+    figure.savefig(path, dpi=DPI, metadata={"Software": None})
 
 
 def shown_views(garment: FlatGarment, views: Sequence[View]) -> list[View]:

@@ -7,10 +7,12 @@ from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patheffects import withStroke
 
+from vflatten_ros.core.turntable import TURN
 from vflatten_ros.core.values import FlatGarment, Float, View
 
 # colour-blind-safe (Okabe and Ito 2008)
@@ -19,6 +21,7 @@ PURPLE, SKY, INK, CLOTH = "#CC79A7", "#56B4E9", "#333333", "#E3ECF3"
 VIEW_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILION)
 FLAT_COLOURS = "cividis"  # by u in the flat plane
 CM = 100.0
+SLICE_M = 0.004  # above and below the height of a slice
 
 
 def draw_view(ax: Axes, garment: FlatGarment, view: View, colour: str) -> None:
@@ -38,6 +41,18 @@ def draw_view(ax: Axes, garment: FlatGarment, view: View, colour: str) -> None:
             fontweight="bold", fontsize=12, path_effects=halo(),
         )  # fmt: skip
     cm_axes(ax, "x (cm)", "y, up (cm)")
+
+
+def draw_slice(ax: Axes, views: Sequence[View]) -> None:
+    """What the views see of the item at its middle height, from above; cm from the wrist axis."""
+    seen = [view.points_hanger for view in views]
+    middle = float(np.median(np.concatenate(seen)[:, 2]))
+    for view, xyz in zip(views, seen, strict=True):
+        x, y, _ = CM * xyz[np.abs(xyz[:, 2] - middle) < SLICE_M].T
+        colour = colormaps["twilight"](view.angle_rad / TURN % 1.0)
+        ax.plot(x, y, ".", ms=2, color=colour)
+    ax.plot(0.0, 0.0, "+", ms=12, color=INK)
+    cm_axes(ax, "x (cm)", "y (cm)")
 
 
 def draw_stress(ax: Axes, garment: FlatGarment) -> None:

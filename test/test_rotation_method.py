@@ -13,7 +13,17 @@ from recordings import BAGS
 
 from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.categories import load_templates
-from vflatten_ros.core import fused, grain, grouping, parallel, pipeline, rotation, turning, ways
+from vflatten_ros.core import (
+    fused,
+    grain,
+    grouping,
+    parallel,
+    pipeline,
+    rotation,
+    tried,
+    turning,
+    ways,
+)
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface, InvalidCalibration
 from vflatten_ros.files import calibration_beside, load_calibration
@@ -265,6 +275,13 @@ def test_the_same_bytes_on_one_thread_and_without_views_prepared_before(monkeypa
     monkeypatch.setattr(parallel, "THREADS", 1)
     again = pipeline.flatten_garment(replayed.views, (), replayed.templates, ALL_VIEWS)
     assert json_text(garment_result(again, replayed.views)) == first
+
+
+@pytest.mark.slow
+def test_sizes_are_as_uncertain_as_where_parts_lie(monkeypatch):
+    monkeypatch.setattr(tried.Tried, "apart_sigma_m", 0.03)
+    garment = replay_recording(BAGS / "SK2_1", ALL_VIEWS).garment
+    assert all(0.042 < size.sigma_m < 0.06 for size in garment.measurements)  # of two ends
 
 
 @pytest.mark.slow

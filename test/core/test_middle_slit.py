@@ -216,6 +216,16 @@ def test_a_doubtful_slit_makes_the_category_doubtful(monkeypatch, chance):
     assert best.found.probabilities["skirt"] == pytest.approx(1.0 - chance, abs=0.1)
 
 
+def test_an_item_with_a_slit_has_legs_whatever_else_it_looks_like():
+    skirt = called(laid(*legs(folded=False, joined=1.0))).found
+    still = dict.fromkeys(skirt.probabilities, 0.0) | {"skirt": 0.99, "shorts": 0.01}
+    cut = replace(skirt, probabilities=still)
+    whole = replace(skirt, probabilities=still | {"skirt": 1.0, "shorts": 0.0})
+    told = ways._slit_or_not(whole, cut, 0.2, load_templates())
+    assert told["shorts"] == pytest.approx(0.2)
+    assert told["skirt"] == pytest.approx(0.8)
+
+
 def test_the_more_noise_joins_the_faces_the_less_likely_is_a_slit():
     sure, doubtful, gone = (found(*legs(speckle=share)) for share in (0.0, 0.1, 0.2))
     assert sure.probability > 0.99

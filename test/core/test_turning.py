@@ -48,6 +48,8 @@ def test_the_axis_is_found_by_what_turned_about_it(shift_m, lean_deg):
     assert moved_m < 0.0003
     assert leaned_rad < np.radians(0.06)
     assert found.calibration.joint_sign == 1
+    tip = np.subtract(found.calibration.gripper_tip, CALIBRATION.gripper_tip)
+    assert np.linalg.norm(np.cross(tip, CALIBRATION.axis_direction)) < 0.0003
     assert abs(found.moved_m - shift_m) < 0.0005
     assert abs(found.leaned_rad - np.radians(lean_deg)) < np.radians(0.1)
     assert found.agreement.enough
@@ -109,6 +111,23 @@ def test_a_result_is_about_the_axis_that_the_views_show(shift_m, lean_deg, notic
         off.append(cKDTree(true).query(where)[0])
     assert np.median(off) < 0.002  # points of the body are 4 mm apart
     assert apart(CALIBRATION, shown)[0] < 0.001
+
+
+def test_points_stay_where_the_rig_saw_them_whatever_the_axis():
+    rough = off_by(0.05, 4.0, way=0.0)  # sideways: the hanger frame turns towards the rig
+    views = views_of(STILL, assumed=rough)
+    fused = fuse_views(views, CONFIG)
+    kept = [view_surface(view, CONFIG).index for view in views]
+    for k, view in enumerate(views):
+        xyz = fused.points.xyz[fused.points.view == k]
+        there = transform_points(fused.calibration.T_rig_hanger(view.angle_rad), xyz)
+        assert np.linalg.norm(there - view.points_rig[kept[k]], axis=1).mean() < 0.0008
+
+
+def test_two_pairs_of_views_move_no_axis():
+    rough = off_by(0.01, 2.0)
+    views = views_of(STILL[:9], assumed=rough)[:3]
+    assert fuse_views(views, CONFIG).calibration == rough
 
 
 def test_a_calibration_as_good_as_the_views_stays():

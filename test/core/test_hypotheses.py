@@ -33,6 +33,7 @@ def tried(
     dent_m=0.0,
     doubled=None,
     hidden=0.0,
+    torn_m=0.0,
 ):
     """A towel of 0.4 x 0.4 m, or what is said of it; its upper edge may lie further in.
 
@@ -49,15 +50,25 @@ def tried(
     on_others = np.argsort(points.uv[:, 0])[: round(1000 * (doubled or 0.0))]
     points.xyz_hanger[on_others, 2] = 0.1 * np.arange(len(on_others))
     unfolded = SimpleNamespace(
-        share=share, overlap=overlap, outline=outline, points=points, parts=(None,) * parts
+        share=share,
+        overlap=overlap,
+        outline=outline,
+        points=points,
+        side=np.where(np.arange(1000) % 2, 1.0, -1.0),
+        parts=(None,) * parts,
     )
+    points.xyz_hanger[::2, 2] += torn_m
     found = SimpleNamespace(
         category=category,
         probabilities={"towel": sure, "skirt": 1.0 - sure, "unknown": 0.0},
         fit=SimpleNamespace(
             misfit=misfit,
             explained=explained,
-            template=SimpleNamespace(vertices=4, single_sheet=doubled is not None),
+            template=SimpleNamespace(
+                vertices=4,
+                single_sheet=doubled is not None,
+                seam=np.array([False, True, False, True]) & (doubled is None),
+            ),
             points=lambda: square,
         ),
     )
@@ -93,6 +104,12 @@ def test_an_item_of_which_much_was_not_seen_is_worse():
     assert tried(unseen=0.19).badness == tried().badness
     assert tried(unseen=0.6).badness == pytest.approx(tried().badness + 1.6)
     assert tried(unseen=0.6).untrusted and not tried(unseen=0.25).untrusted
+
+
+def test_a_way_that_tears_the_seams_of_its_category_is_worse():
+    assert tried(torn_m=0.01).torn == tried().torn == 0.0
+    assert tried(torn_m=0.2).torn == 1.0
+    assert tried(torn_m=0.2).badness > tried().badness + 1.0
 
 
 def test_cloth_that_is_hidden_between_parts_counts_and_makes_sizes_uncertain():

@@ -28,7 +28,10 @@ from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.helper import HelperProcess
 from vflatten_ros.processes import SETTINGS
 
-CONFIG, TEMPLATES = Config(), load_templates()
+CONFIG = dataclasses.replace(
+    Config(), rotation=dataclasses.replace(Config().rotation, draw=2)
+)  # with which the best way of the item is one that the helper tries
+TEMPLATES = load_templates()
 READY_S = 60.0
 
 

@@ -161,6 +161,16 @@ def test_cloud_and_markers_cover_the_newest_view():
     assert len(fields["data"]) == fields["row_step"] == fields["width"] * fields["point_step"]
 
 
+def test_what_hangs_is_shown_about_the_axis_that_the_views_told():
+    newest, axis = VIEWS[1], VIEWS[1].calibration
+    point, tip = (tuple(x + 0.03 for x in at) for at in (axis.axis_point, axis.gripper_tip))
+    told = replace(axis, axis_point=point, gripper_tip=tip)
+    fields = displays.points_fields(replace(GARMENT, calibration=told), VIEWS)
+    rows = np.frombuffer(fields["data"].tobytes(), "<f4").reshape(fields["width"], -1)
+    there = transform_points(told.T_rig_hanger(newest.angle_rad), GARMENT.points.xyz_hanger)
+    assert np.abs(rows[:, :3] - there[GARMENT.points.view_id >= 0]).max() < 1e-6
+
+
 def test_markers_show_every_part():
     markers = displays.marker_fields(GARMENT, VIEWS)["markers"]
     by_name = {marker["ns"]: marker for marker in markers}

@@ -85,6 +85,19 @@ def test_a_landmark_hangs_nowhere_where_nothing_was_seen():
     assert mark["xyz"] is None and mark["xyz_sigma_m"] is None and not mark["seen"]
 
 
+def test_landmarks_hang_about_the_axis_that_the_views_told():
+    """Not about that of the calibration which the views came with."""
+    shifted = tuple(x + 0.03 for x in CALIBRATION.axis_point)
+    tip = tuple(x + 0.03 for x in CALIBRATION.gripper_tip)
+    told = dataclasses.replace(CALIBRATION, axis_point=shifted, gripper_tip=tip)
+    garment = dataclasses.replace(GARMENT, calibration=told)
+    pairs = zip(results.garment_result(garment, VIEWS)["landmarks"], GARMENT.landmarks, strict=True)
+    T = told.T_rig_hanger(0.0)
+    for found, mark in pairs:
+        there = T[:3, :3] @ np.array(mark.xyz_hanger) + T[:3, 3]
+        assert found["xyz"] == pytest.approx(there.tolist())
+
+
 def test_numbers_equal_the_message_fields_exactly():
     fields = messages.flattened_view_fields(GARMENT, VIEWS)
     read_back = json.loads(results.json_text(RESULT))

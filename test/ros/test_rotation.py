@@ -3,6 +3,7 @@
 import numpy as np
 import rclpy
 import slow_work
+from garments import CALIBRATION, example_garment
 from geometry_msgs.msg import PolygonStamped
 from ros_rig import LATCHED
 from sensor_msgs.msg import Image, PointCloud2
@@ -110,6 +111,9 @@ def test_landmarks_turn_with_the_wrist(rig):
     assert there.status.code == now.status.code == msg.Status.OK
     assert there.position.header.frame_id == "rig_optical"
     p, q = there.position.point, back.position.point
+    (mark,) = (m for m in example_garment().landmarks if m.name == "left_top_corner")
+    by_result = CALIBRATION.T_rig_hanger(0.0) @ [*mark.xyz_hanger, 1.0]  # not by the node's own
+    assert np.allclose([p.x, p.y, p.z], by_result[:3], atol=1e-9)
     assert np.hypot(p.x - q.x, p.z - q.z) > 0.2  # a corner 0.12 m from the axis, to the other side
     for name, code in (("left_ear", "UNKNOWN_NAME"), ("left_bottom_corner", "NOT_SEEN")):
         answer = rig.ask("locate_landmark", name=name)

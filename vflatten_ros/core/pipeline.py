@@ -163,7 +163,8 @@ def _rotation(
     given, told = fused.given, fused.notices + fused.given.notices
     best = likeliest(fused, tuple(templates), config, progress, helper)
     config = replace(config, rotation=best.rotation)
-    calibration = fused.calibration
+    calibration = fused.calibration or views[0].calibration
+    about_axis = [replace(view, calibration=calibration) for view in views]
     del fused  # its points are many
     unfolded, found = best.unfolded, best.found
     turn, turns = 0, TURNS if found.category != UNKNOWN else 0
@@ -205,7 +206,7 @@ def _rotation(
         outline=unfolded.outline,
         correspondences=given.used,
         notices=notices,
-        seen=coverage(unfolded.surface, views),
+        seen=coverage(unfolded.surface, about_axis),
         calibration=calibration,
         outline_sigma_m=float(
             np.linalg.norm([config.rotation.outline_sigma_m, placed_m, best.apart_sigma_m])

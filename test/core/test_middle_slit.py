@@ -175,9 +175,25 @@ def test_axes_lead_from_either_end_of_a_category_up_its_middle():
     assert low.width_m == pytest.approx(np.linalg.norm(hem))
 
 
-def laid(uv, side, edge, links):
+def test_a_rectangle_has_a_middle_across_too():
+    (towel,) = (t for t in load_templates() if t.category == "towel")
+    state, pose = np.zeros(towel.dimensions), np.array([0.4, 1.0, -2.0])
+    points = place(towel, pose, state)[0]
+    low, _, left, right = axes_of(points[: towel.vertices], pose, across=True)
+    corner = {name: points[towel.landmarks[name]] for name in towel.landmarks}
+    sides = [
+        (corner[f"{side}_bottom_corner"] + corner[f"{side}_top_corner"]) / 2
+        for side in ("left", "right")
+    ]
+    assert left.start == pytest.approx(sides[0]) and right.start == pytest.approx(sides[1])
+    assert left.start + left.length_m * left.ahead == pytest.approx(right.start)
+    assert right.ahead == pytest.approx(-left.ahead)
+    assert (left.length_m, left.width_m) == pytest.approx((low.width_m, low.length_m))
+
+
+def laid(uv, side, edge, links, flare=0.2, wide=1.0):
     """An item laid flat, wider at the hem: its samples in any order, without some."""
-    wider = 1.0 + 0.2 * (1.0 - uv[:, 1] / HEIGHT_M)
+    wider = wide + flare * (1.0 - uv[:, 1] / HEIGHT_M)
     uv = np.column_stack([WIDTH_M / 2 + (uv[:, 0] - WIDTH_M / 2) * wider, uv[:, 1]])
     row = np.random.default_rng(5).permutation(len(uv))[: int(0.98 * len(uv))]
     nothing = np.zeros(len(uv))
@@ -203,6 +219,23 @@ def test_legs_that_links_join_are_legs_and_what_is_of_one_piece_is_not(monkeypat
     assert whole.unfolded.surface.banks is None
     monkeypatch.setattr(ways, "parted", lambda *_: None)
     assert called(laid(*legs())).found.category == whole.found.category
+
+
+@pytest.mark.parametrize("wide", [1.0, 1.25])
+def test_legs_that_make_a_rectangle_are_no_towel(monkeypatch, wide):
+    """Whichever way it is longer: a rectangle has two middles."""
+    fit = called(laid(*legs(), flare=0.0, wide=wide)).found.fit
+    assert fit.template.category == "shorts"
+    inseam_m = fit.template.measure(fit.state, fit.covariance[3:, 3:])["inseam"][0]
+    assert inseam_m == pytest.approx(CROTCH_M, abs=0.02)
+    monkeypatch.setattr(ways, "parted", lambda *_: None)
+    assert called(laid(*legs(), flare=0.0, wide=wide)).found.category == "towel"
+
+
+def test_a_towel_stays_whole():
+    towel = called(laid(*legs(folded=False, joined=1.0), flare=0.0))
+    assert towel.found.category == "towel"
+    assert towel.unfolded.surface.banks is None
 
 
 @pytest.mark.parametrize("chance", [0.1, 0.9])

@@ -73,7 +73,7 @@ class Banks:
         return Banks(self.side[row], self.along_m[row])
 
 
-def axes_of(outline: Float, pose: Float) -> tuple[Axis, Axis]:
+def axes_of(outline: Float, pose: Float, across: bool = False) -> tuple[Axis, ...]:
     """The axis of symmetry of a category as it fits an item, from either end.
 
     Parameters
@@ -82,15 +82,22 @@ def axes_of(outline: Float, pose: Float) -> tuple[Axis, Axis]:
         Of the category, m.
     pose : ndarray of shape (3,)
         Rotation, rad, and shift, m, of the category.
+    across : bool
+        Whether the line across its middle is one, too, as a rectangle's is.
     """
     angle, origin = float(pose[0]), pose[1:]
     right, ahead = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    along = (outline - origin) @ ahead
+    along, beside = (outline - origin) @ ahead, (outline - origin) @ right
     low, high = float(along.min()), float(along.max())
-    length_m, width_m = high - low, float(np.ptp(outline @ right))
+    length_m, width_m = high - low, float(np.ptp(beside))
     from_low = Axis(origin + low * ahead, ahead, length_m, width_m)
     from_high = Axis(origin + high * ahead, -ahead, length_m, width_m)
-    return from_low, from_high
+    if not across:
+        return from_low, from_high
+    middle = origin + (low + high) / 2 * ahead
+    from_left = Axis(middle + beside.min() * right, right, width_m, length_m)
+    from_right = Axis(middle + beside.max() * right, -right, width_m, length_m)
+    return from_low, from_high, from_left, from_right
 
 
 def middle_slit(

@@ -226,8 +226,9 @@ def _recognised(
         return recognise(outline, points, templates, config.recognition, progress, begin)
 
     found = named(unfolded)
-    if begin is None and (fit := found.fit) is not None and _like_legs(fit.template):
-        axes = axes_of(fit.points()[: fit.template.vertices], fit.pose)
+    if begin is None and (fit := found.fit) is not None and not fit.template.parts:
+        outline = fit.points()[: fit.template.vertices]
+        axes = axes_of(outline, fit.pose, across=fit.template.single_sheet)
         cut = parted(unfolded, axes, config.rotation)  # are these legs?
         if cut is not None:
             legs, chance = named(cut[0]), cut[1]

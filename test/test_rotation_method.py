@@ -285,6 +285,13 @@ def test_sizes_are_as_uncertain_as_where_parts_lie(monkeypatch):
 
 
 @pytest.mark.slow
+def test_sizes_are_as_uncertain_as_a_bad_fit_makes_them(monkeypatch):
+    monkeypatch.setattr(tried.Tried, "size_sigma", 0.1)
+    garment = replay_recording(BAGS / "SK2_1", ALL_VIEWS).garment
+    assert all(0.1 < size.sigma_m / size.value_m < 0.13 for size in garment.measurements)
+
+
+@pytest.mark.slow
 def test_an_outline_that_its_category_does_not_explain_is_not_trusted(monkeypatch):
     monkeypatch.setattr(pipeline, "MOST_DEEP_M", -1.0)
     garment = replay_recording(BAGS / "SH1_1", ALL_VIEWS).garment

@@ -126,6 +126,13 @@ def test_cloth_that_is_hidden_between_parts_counts_and_makes_sizes_uncertain():
     assert fold == pytest.approx(np.hypot(0.03, whole.apart_sigma_m))
 
 
+def test_sizes_are_the_less_certain_the_worse_the_item_lies():
+    assert tried().size_sigma == 0.0
+    bad = tried(overlap=0.21, misfit=0.3)
+    assert bad.badness > 1.0
+    assert bad.size_sigma == pytest.approx(0.05 * bad.badness)
+
+
 def test_a_single_sheet_lies_on_no_other_cloth_of_its_own():
     garment = tried().badness
     assert 0.0 < tried(doubled=0.01).doubled < 0.06

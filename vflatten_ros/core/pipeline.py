@@ -211,6 +211,7 @@ def _rotation(
         outline_sigma_m=float(
             np.linalg.norm([config.rotation.outline_sigma_m, placed_m, best.apart_sigma_m])
         ),
+        size_sigma=best.size_sigma,
     )
     return flattened, found
 
@@ -246,7 +247,10 @@ def _described(
     used = sorted({int(i) for i in points.view_id if i >= 0})
     shared = np.sqrt(2.0) * flattened.outline_sigma_m  # of two ends
     measurements = tuple(
-        replace(m, sigma_m=float(np.hypot(m.sigma_m, shared))) for m in measured.measurements
+        replace(
+            m, sigma_m=float(np.linalg.norm([m.sigma_m, shared, flattened.size_sigma * m.value_m]))
+        )
+        for m in measured.measurements
     )
     if automatic and recognition.fit is not None and recognition.category != UNKNOWN:
         outline = with_category(outline, recognition.fit, config.recognition.misfit_m)

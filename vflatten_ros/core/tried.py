@@ -32,6 +32,8 @@ UNSURE = 0.7  # probability of its category below which it is not, either
 OF_STRIP = 0.35  # of the width of the strip that what is hidden would make across the item
 IN_FOLD_M = 0.03  # how much cloth a fold between two parts of a single sheet hides, one deviation:
 # 4 to 5 cm in four towels. Nothing else tells how far apart they lie
+OF_SIZE = 0.05  # deviation of a size, as a share of it, for each 1 of badness: so large were the
+# errors of results that were not trusted
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 MOSTLY_DOUBLED = 0.1  # share of a single sheet on other cloth of its own that counts as 1
@@ -115,6 +117,11 @@ class Tried:
         strip_m = self.hidden * float(np.sqrt(area_m2))
         single = self.found.fit.template.single_sheet
         return float(np.hypot(IN_FOLD_M if single else 0.0, OF_STRIP * strip_m))
+
+    @property
+    def size_sigma(self) -> float:
+        """How uncertain sizes are by how badly the item lies flat, as a share of them."""
+        return OF_SIZE * max(0.0, self.badness)
 
     @property
     def unseen(self) -> float:

@@ -234,6 +234,7 @@ class Flattened:
     )  # the largest is the outline's; others are loose
     seen: Coverage | None = None  # None: not known
     outline_sigma_m: float = 0.0  # error that a whole edge shares, beside that of its points
+    size_sigma: float = 0.0  # error of a length, as a share of it, beside those
     calibration: Calibration | None = None  # of the hanger frame; None: that of the views
 
 

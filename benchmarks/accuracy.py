@@ -57,7 +57,7 @@ RUNS = {
     "calibration": "All views, the calibrated axis 3 mm and 0.5 degrees off",
     "drawn": "All views, other samples of the same surface (`rotation.draw`)",
 }
-DRAWN = 19  # none of the draws that the method takes, or that it was built with
+DRAWN = 20  # none of the draws that the method takes, or that it was built with
 USUAL_M = 1.4  # from the rig to the wrist's axis, at most
 FAILED_SIZE_PCT = 7.0  # a size further off than this is drawn
 

@@ -278,17 +278,12 @@ def test_the_same_bytes_on_one_thread_and_without_views_prepared_before(monkeypa
 
 
 @pytest.mark.slow
-def test_sizes_are_as_uncertain_as_where_parts_lie(monkeypatch):
+def test_sizes_are_as_uncertain_as_where_parts_lie_and_as_a_bad_fit_makes_them(monkeypatch):
     monkeypatch.setattr(tried.Tried, "apart_sigma_m", 0.03)
-    garment = replay_recording(BAGS / "SK2_1", ALL_VIEWS).garment
-    assert all(0.042 < size.sigma_m < 0.06 for size in garment.measurements)  # of two ends
-
-
-@pytest.mark.slow
-def test_sizes_are_as_uncertain_as_a_bad_fit_makes_them(monkeypatch):
-    monkeypatch.setattr(tried.Tried, "size_sigma", 0.1)
-    garment = replay_recording(BAGS / "SK2_1", ALL_VIEWS).garment
-    assert all(0.1 < size.sigma_m / size.value_m < 0.13 for size in garment.measurements)
+    monkeypatch.setattr(tried.Tried, "size_sigma", 0.2)
+    for size in replay_recording(BAGS / "SK2_1", ALL_VIEWS).garment.measurements:
+        least_m = np.hypot(0.042, 0.2 * size.value_m)  # where parts lie is of two ends
+        assert least_m < size.sigma_m < 1.1 * least_m
 
 
 @pytest.mark.slow

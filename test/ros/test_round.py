@@ -11,10 +11,11 @@ from mcap.reader import make_reader
 from rclpy.serialization import deserialize_message
 from ros_rig import CALIBRATION, REAL, RECORDING, ROOT, Process, Rig
 from running import cpu_s, gone
-from vflatten_ros.msg import FlattenedView, GarmentEstimate
+from vflatten_ros.msg import FlattenedView, GarmentEstimate, Status
 
 from vflatten_ros import messages
 
+ACTIVE = 3  # of lifecycle_msgs
 KINDS = {"flattened_view": FlattenedView, "garment": GarmentEstimate}
 
 
@@ -94,3 +95,24 @@ def test_the_planners_round_gives_what_replay_gives(ros, tmp_path, method, rate,
         differing = [field for field in ours if not same(ours[field], theirs[field])]
         assert not differing, f"{name}: {differing}"
         assert len(live.view_ids if name == "flattened_view" else live.measurements) > 1
+
+
+def test_a_joint_that_turns_the_other_way_is_told_and_the_node_goes_on(ros, tmp_path):
+    """The likeliest mistake of an installation: joint_sign is wrong."""
+    wrong = tmp_path / "calibration.yaml"
+    wrong.write_text(CALIBRATION.read_text().replace("joint_sign: -1", "joint_sign: 1"))
+    parameters = ["method:=rotation", "auto_flatten:=false", "worker_nice:=0"]
+    given = [text for parameter in parameters for text in ("-p", parameter)]
+    rig = Rig(tmp_path, kind=REAL, arguments=["--calibration", str(wrong), "--ros-args", *given])
+    try:
+        rig.turn()
+        buffer = rig.until(rig.complete, "the rotation")
+        result = rig.flatten().result
+        assert result.status.code == Status.FAILED
+        assert "set joint_sign to -1" in result.status.message
+        asked = rig.ask("flatten")
+        assert not asked.success and "set joint_sign to -1" in asked.message
+        assert [view.id for view in rig.buffer().views] == [view.id for view in buffer.views]
+        assert rig.lifecycle_state() == ACTIVE
+    finally:
+        rig.close()

@@ -35,8 +35,8 @@ IN_FOLD_M = 0.03  # how much cloth a fold between two parts of a single sheet hi
 OF_SIZE = 0.05  # deviation of a size, as a share of it, for each 1 of badness: so large were the
 # errors of results that were not trusted
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
-BETWEEN, MOSTLY_BETWEEN = 0.2, 0.1  # the same of an item in parts that only the category joins:
-# what is left out may be what lies between them
+BETWEEN, MOSTLY_BETWEEN, WORST_BETWEEN = 0.2, 0.1, 0.5  # the same of an item in parts that only the
+# category joins: what is left out may be what lies between them; and what that counts at most
 LAID, MOSTLY_LAID = 0.05, 0.08  # overlap that any garment laid flat has; more that counts as 1
 MOSTLY_DOUBLED = 0.1  # share of a single sheet on other cloth of its own that counts as 1
 TORN, MOSTLY_TORN = 0.08, 0.15  # share of the seams along which front and back hang apart; more
@@ -151,7 +151,8 @@ class Tried:
             odd += ODD
         odd += max(0.0, self.missing - MISSING) / MOSTLY_MISSING
         if len(self.unfolded.parts) > 1:
-            left_out += max(0.0, 1.0 - self.unfolded.share - BETWEEN) / MOSTLY_BETWEEN
+            between = max(0.0, 1.0 - self.unfolded.share - BETWEEN) / MOSTLY_BETWEEN
+            left_out += min(between, WORST_BETWEEN)
         left_out += ASIDE * self.aside
         left_out += max(0.0, self.unseen - UNSEEN) / MOSTLY_UNSEEN
         left_out += max(0.0, self.hidden - HIDDEN) / MOSTLY_HIDDEN

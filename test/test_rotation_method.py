@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 
 import cv2
@@ -31,6 +32,12 @@ from vflatten_ros.replay import replay_recording
 from vflatten_ros.results import garment_result, json_text
 
 ALL_VIEWS = dataclasses.replace(Config(), method="rotation")
+
+
+@functools.cache
+def replayed(name):
+    """All views of a carried recording by the defaults; several tests ask about it."""
+    return replay_recording(BAGS / name, ALL_VIEWS)
 
 
 def point_error_m(garment, folder):
@@ -80,7 +87,7 @@ def untrusted(garment):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["LS1_1", "SH1_1", "TR1_1", "SK2_1"])
 def test_category_sizes_and_places_come_out_right(name):
-    garment = replay_recording(BAGS / name, ALL_VIEWS).garment
+    garment = replayed(name).garment
     category, wrong = errors(garment, BAGS / name)
     assert garment.category == category
     assert max(wrong) < 0.07
@@ -126,7 +133,7 @@ def test_a_leg_that_hangs_by_hidden_cloth_is_put_in_its_place(monkeypatch):
     folder = BAGS / "TR1_1"
     placed = replay_recording(folder, one_way).garment
     monkeypatch.undo()
-    whole = replay_recording(folder, ALL_VIEWS).garment
+    whole = replayed("TR1_1").garment
     assert all(len(turned.parts) == 2 for turned in parts) and len(parts) > 0
     category, off = errors(placed, folder)
     assert placed.category == category and max(off) < 0.04
@@ -270,11 +277,11 @@ def test_a_quarter_of_a_rotation_is_not_trusted_or_says_what_was_not_seen():
 
 @pytest.mark.slow
 def test_the_same_bytes_on_one_thread_and_without_views_prepared_before(monkeypatch):
-    replayed = replay_recording(BAGS / "SK2_1", ALL_VIEWS)
-    first = json_text(garment_result(replayed.garment, replayed.views))
+    before = replayed("SK2_1")
+    first = json_text(garment_result(before.garment, before.views))
     monkeypatch.setattr(parallel, "THREADS", 1)
-    again = pipeline.flatten_garment(replayed.views, (), replayed.templates, ALL_VIEWS)
-    assert json_text(garment_result(again, replayed.views)) == first
+    again = pipeline.flatten_garment(before.views, (), before.templates, ALL_VIEWS)
+    assert json_text(garment_result(again, before.views)) == first
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -34,10 +35,12 @@ def tried(
     doubled=None,
     hidden=0.0,
     torn_m=0.0,
+    cloth=0.9,
 ):
     """A towel of 0.4 x 0.4 m, or what is said of it; its upper edge may lie further in.
 
-    With a share that is `doubled` it is a single sheet.
+    With a share that is `doubled` it is a single sheet; `cloth` is how much of its two sides was
+    seen, shown by 1000 samples and those that were left out.
     """
     square = np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.4], [0.0, 0.4]])
     share_ = np.linspace(0.0, 1.0, 25, endpoint=False)[:, None]
@@ -72,7 +75,8 @@ def tried(
             points=lambda: square,
         ),
     )
-    return Tried(unfolded, found, aside)
+    spacing_m = math.sqrt(cloth * 2.0 * 0.4**2 * share / 1000)
+    return Tried(unfolded, found, aside, rotation=RotationConfig(spacing_m=spacing_m))
 
 
 def settled(tries):
@@ -150,6 +154,16 @@ def test_a_single_sheet_lies_on_no_other_cloth_of_its_own():
 def test_a_large_piece_left_aside_is_worse_than_as_many_shreds():
     shreds, piece = tried(share=0.75), tried(share=0.75, aside=0.2)
     assert piece.badness > shreds.badness + 0.3
+
+
+def test_a_category_has_about_as_much_cloth_as_was_seen():
+    assert tried(cloth=0.7, share=0.5).cloth == pytest.approx(0.7)  # what is left out was seen, too
+    for share in (1.0, 0.5):
+        odd = [
+            tried(cloth=cloth, share=share).badness - tried(share=share).badness
+            for cloth in (0.6, 1.2, 2.0, 0.4)
+        ]
+        assert odd == pytest.approx([0.0, 0.0, 2.5, 1.0])
 
 
 def test_a_way_that_fits_nothing_is_the_worst():

@@ -33,6 +33,10 @@ UNSURE = 0.7  # probability of its category below which it is not, either
 OF_STRIP = 0.35  # of the width of the strip that what is hidden would make across the item
 IN_FOLD_M = 0.03  # how much cloth a fold between two parts of a single sheet hides, one deviation:
 # 4 to 5 cm in four towels. Nothing else tells how far apart they lie
+OF_ANY_SIZE = (
+    0.005  # deviation of a size, as a share of it, whatever else is uncertain: lengths along
+)
+# the cloth are off together. Of sizes over 60 cm 4 % were off by more than three deviations without
 OF_SIZE = 0.05  # deviation of a size, as a share of it, for each 1 of badness: so large were the
 # errors of results that were not trusted
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
@@ -137,8 +141,8 @@ class Tried:
 
     @property
     def size_sigma(self) -> float:
-        """How uncertain sizes are by how badly the item lies flat, as a share of them."""
-        return OF_SIZE * max(0.0, self.badness)
+        """How uncertain sizes are as a share of them, the more the worse the item lies flat."""
+        return float(np.hypot(OF_ANY_SIZE, OF_SIZE * max(0.0, self.badness)))
 
     @property
     def unseen(self) -> float:

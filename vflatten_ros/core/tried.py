@@ -33,10 +33,9 @@ UNSURE = 0.7  # probability of its category below which it is not, either
 OF_STRIP = 0.35  # of the width of the strip that what is hidden would make across the item
 IN_FOLD_M = 0.03  # how much cloth a fold between two parts of a single sheet hides, one deviation:
 # 4 to 5 cm in four towels. Nothing else tells how far apart they lie
-OF_ANY_SIZE = (
-    0.005  # deviation of a size, as a share of it, whatever else is uncertain: lengths along
-)
-# the cloth are off together. Of sizes over 60 cm 4 % were off by more than three deviations without
+# Deviation of any size, as a share of it: lengths along the cloth are off together. Without it 4 %
+# of the sizes over 60 cm were off by more than three deviations
+OF_ANY_SIZE = 0.005
 OF_SIZE = 0.05  # deviation of a size, as a share of it, for each 1 of badness: so large were the
 # errors of results that were not trusted
 STRAYS, MOSTLY_LEFT = 0.06, 0.3  # share that any result leaves out; more that counts as 1
@@ -56,8 +55,8 @@ HIDDEN, MOSTLY_HIDDEN = 0.11, 0.25  # share of the category, between parts that 
 # no view shows; more that counts as 1
 ASIDE = 3.0  # of the share that is left out in large groups, beside: it can be no noise
 # Cloth that was seen, in that of the category: of 858 ways right within 5 % between 0.56 and 1.21
-MUCH, MOSTLY_MUCH = 1.25, 0.3  # more that counts as 1
-LITTLE, MOSTLY_LITTLE = 0.55, 0.15  # less that counts as 1
+MOST_CLOTH, MOSTLY_MORE = 1.25, 0.3  # more that counts as 1
+LEAST_CLOTH, MOSTLY_LESS = 0.55, 0.15  # less that counts as 1
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ class Tried:
 
     @cached_property
     def cloth(self) -> float:
-        """Cloth that was seen, laid flat or left out, in that of the category, front and back.
+        """Cloth that was seen, laid flat or left out, as a share of the category's front and back.
 
         There is a sample to every square of `spacing_m`. A leg by itself looks like a skirt, but
         one with less cloth than was seen; of one laid out too wide most would have been hidden.
@@ -169,13 +168,12 @@ class Tried:
         if self.deep_m > MOST_DEEP_M:
             odd += ODD
         odd += max(0.0, self.missing - MISSING) / MOSTLY_MISSING
+        odd += max(0.0, self.cloth - MOST_CLOTH) / MOSTLY_MORE
+        odd += max(0.0, LEAST_CLOTH - self.cloth) / MOSTLY_LESS
         if len(self.unfolded.parts) > 1:
             between = max(0.0, 1.0 - self.unfolded.share - BETWEEN) / MOSTLY_BETWEEN
             left_out += min(between, WORST_BETWEEN)
         left_out += ASIDE * self.aside
-        if self.found.fit is not None:
-            odd += max(0.0, self.cloth - MUCH) / MOSTLY_MUCH
-            odd += max(0.0, LITTLE - self.cloth) / MOSTLY_LITTLE
         left_out += max(0.0, self.unseen - UNSEEN) / MOSTLY_UNSEEN
         left_out += max(0.0, self.hidden - HIDDEN) / MOSTLY_HIDDEN
         unknown = float(self.found.category == UNKNOWN)

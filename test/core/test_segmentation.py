@@ -199,6 +199,22 @@ def test_an_edge_on_start_does_not_lose_the_item():
     assert recall(kept(scene.cloud()), scene.label) > 0.99  # nothing seen for 0.25 m below the tip
 
 
+def test_patches_of_depth_by_chance_are_left_out():
+    """As of stereo that has nothing to match: more and larger than an item's own pieces."""
+    scene = hanging_item()
+    chance = np.random.default_rng(4)
+    for _ in range(150):
+        row, col = chance.integers(0, 470), chance.integers(40, 310)
+        patch = np.s_[row : row + 4, col : col + chance.integers(6, 14)]
+        here = np.zeros(scene.z.shape, bool)
+        here[patch] = True
+        here &= scene.label == 0
+        scene.z[here], scene.label[here] = chance.uniform(1.0, 1.7), SCENE
+    mask = kept(scene.cloud())
+    assert recall(mask, scene.label) > 0.99
+    assert foreign(mask, scene.label) < 0.02 * mask.sum()
+
+
 def test_another_thing_in_the_cylinder_is_left_out():
     scene = hanging_item().add(
         lambda x, y: 1.75 + 0 * x, lambda x, y: (np.abs(x) < 0.5) & (np.abs(y) < 0.1), SCENE

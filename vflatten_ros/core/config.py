@@ -543,7 +543,7 @@ class RotationConfig(Checked):
     )
     trim_edges: bool = option(
         True,
-        "Take pixels off that stereo adds beside edges, where other views tell of them.",
+        "Take points off that stereo adds beside edges and where nothing is, as other views tell.",
     )
     view_fit_m: float = option(
         0.012, "Radius of the local planes of a single view, m.", low=0.002, high=0.1

@@ -15,6 +15,8 @@ from vflatten_ros.core.fat_edges import notice_of as fat_notice
 from vflatten_ros.core.fusion import Points, Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.grain import Grain, borne_out, notices_of, suited, typical
+from vflatten_ros.core.looked_past import NOTED, looked_past, share_looked_past
+from vflatten_ros.core.looked_past import notice_of as past_notice
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.registration import (
     Folded,
@@ -188,9 +190,16 @@ def _registered(
     turned = as_they_turn(views, surfaces, poses, config, progress)
     poses = turned.poses
     grain, apart_m = _told_by_all(surfaces, poses, config)
-    px, within = _edges(views, surfaces, poses, config, grain)
+    share, there = _looked_past(surfaces, poses, apart_m, config)
+    if share:
+        rows, notices = there, (past_notice(share),)
+        seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
+        surfaces, poses = anew(0.0)
+        grain, apart_m = _told_by_all(surfaces, poses, config)
+    px, within = _edges(seen, surfaces, poses, config, grain)
     if px:
-        rows, notices = within, (fat_notice(px),)
+        rows = within if rows is None else [r[w] for r, w in zip(rows, within, strict=True)]
+        notices = (*notices, fat_notice(px))
         seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
         surfaces, poses = anew(0.0)
         grain, apart_m = _told_by_all(surfaces, poses, config)
@@ -203,6 +212,25 @@ def _registered(
     notices = turned.notices + notices
     poses = [turned.T_hanger_common @ pose for pose in poses]
     return _Registered(surfaces, poses, apart_m, turned.calibration, notices)
+
+
+def _looked_past(
+    surfaces: Sequence[ViewSurface],
+    poses: Sequence[Float],
+    apart_m: float,
+    config: RotationConfig,
+) -> tuple[float, list[Int]]:
+    """Share of the points where there is nothing, and the rows of each view's others.
+
+    A share of 0 if it is so small that fits of the surface bear it.
+    """
+    if not config.trim_edges or any(surface.sight is None for surface in surfaces):
+        return 0.0, []
+    if share_looked_past(surfaces, poses, apart_m) < NOTED:
+        return 0.0, []
+    past = looked_past(surfaces, poses, apart_m)
+    share = float(np.concatenate(past).mean())
+    return share, [s.index[~gone] for s, gone in zip(surfaces, past, strict=True)]
 
 
 def _edges(

@@ -27,6 +27,8 @@ Pixels = NDArray[np.int32]
 SAMPLE = 1500  # points from which spacing and planes are estimated
 WALLS = 3  # most planes taken away
 LEVEL = 0.7  # least cosine between the axis and the normal of a table or floor
+MANY = 10  # pieces beside the largest, more than which are noise
+SPECKS = 2.0  # times the area of the last of so many, up to which all are
 SIDE = 0.1  # share of the image at either side in which no item is expected
 
 
@@ -299,7 +301,8 @@ def _held(
     """
     voxel, label = pieces(points, link)
     piece = label[voxel]
-    large = np.bincount(piece) * spacing**2 > config.piece_area_m2
+    area = np.bincount(piece) * spacing**2
+    large = area > max(config.piece_area_m2, _specks_m2(area))
     own = np.bincount(piece, weights=foreign) == 0
     places = _squeezed(centres(points, voxel), calibration)
     distance = np.linalg.norm(places, axis=1)
@@ -307,6 +310,16 @@ def _held(
     own[label[distance.argmin()]] = True
     held: Bool = _reached(places, label, large & own, config.gap_m + link)[piece]
     return held
+
+
+def _specks_m2(area: Float) -> float:
+    """Up to which area pieces are noise, by their number: an item hangs in a few.
+
+    Where stereo has nothing to match, it finds depths by chance, for patches of some size.
+    """
+    if len(area) <= MANY:
+        return 0.0
+    return SPECKS * float(np.sort(area)[-1 - MANY])
 
 
 def _squeezed(points: Points, calibration: Calibration) -> Points:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from vflatten_ros.core.geometry import inverse, transform_points
 from vflatten_ros.core.raygrid import RayGrid, camera_rays
-from vflatten_ros.core.values import Float, Int
+from vflatten_ros.core.values import Bool, Float, Int
 
 BEYOND_M = 0.012  # from the end of a sheet to where a camera is asked what lies there
 MARGIN_M = 0.004  # what is as much farther away lies behind
@@ -35,6 +35,22 @@ class Sight:
     grid: RayGrid  # its frame is that of the points it was made of
     low: Int  # (2,) row and column of the first pixel of the image
     depth: Float32  # (rows, cols) least of the pixels around; inf where none shows the item
+    shape: tuple[int, int]  # rows and columns of the image
+
+    def behind(self, points: Float) -> Float:
+        """How much farther away than points (n, 3) the item is along their rays, m.
+
+        Infinite where the view shows nothing of it, not a number beyond the image.
+        """
+        place, depth = self.grid.to_grid(points)
+        at = np.rint(place).astype(np.int64)
+        beyond = ((at < 0) | (at >= self.shape)).any(axis=1)
+        row, col = (at - self.low).T
+        rows, cols = self.depth.shape
+        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+        there = self.depth[row.clip(0, rows - 1), col.clip(0, cols - 1)]
+        behind: Float = np.where(beyond, np.nan, np.where(inside, there, np.inf) - depth)
+        return behind
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +59,16 @@ class PlacedSight:
 
     sight: Sight
     T_common_view: Float  # (4, 4) takes the frame of the sight to the common one
+
+    def facing(self, xyz: Float, normal: Float, least: float) -> Bool:
+        """Whether surfaces (n, 3) with normals (n, 3), common frame, face it by a cosine."""
+        grid = self.sight.grid
+        if grid.parallel:
+            toward = np.broadcast_to(-self.T_common_view[:3, :3] @ grid.ray0, xyz.shape)
+        else:
+            toward = transform_points(self.T_common_view, grid.origin[None]) - xyz
+        facing: Bool = (toward * normal).sum(1) > least * np.linalg.norm(toward, axis=1)
+        return facing
 
 
 def sight_of(points: Float, pixel: NDArray[np.int32], shape: tuple[int, int]) -> Sight | None:
@@ -64,7 +90,7 @@ def sight_of(points: Float, pixel: NDArray[np.int32], shape: tuple[int, int]) ->
     depth = np.full(pixel.max(axis=0) - low + AROUND_PX + 1, np.inf, dtype=np.float32)
     depth[row, col] = grid.to_grid(points)[1]
     around = np.ones((AROUND_PX, AROUND_PX), np.uint8)
-    return Sight(grid, low.astype(np.int64), np.asarray(cv2.erode(depth, around)))
+    return Sight(grid, low.astype(np.int64), np.asarray(cv2.erode(depth, around)), shape)
 
 
 def goes_on(xyz: Float, normal: Float, outward: Float, sights: Sequence[PlacedSight]) -> Int:
@@ -85,28 +111,12 @@ def goes_on(xyz: Float, normal: Float, outward: Float, sights: Sequence[PlacedSi
     """
     seen, free = np.zeros(len(xyz)), np.zeros(len(xyz))
     for placed in sights:
-        sight = placed.sight
         T_view_common = inverse(placed.T_common_view)
-        camera = transform_points(placed.T_common_view, sight.grid.origin[None])[0]
-        toward = camera - xyz
-        if sight.grid.parallel:
-            toward = np.broadcast_to(-placed.T_common_view[:3, :3] @ sight.grid.ray0, xyz.shape)
-        facing = (toward * normal).sum(1) > FACING * np.linalg.norm(toward, axis=1)
-        behind = _behind(sight, transform_points(T_view_common, xyz))
-        here = facing & (behind > -NEARER_M) & (behind < FARTHER_M)
-        there = _behind(sight, transform_points(T_view_common, xyz + BEYOND_M * outward))
+        behind = placed.sight.behind(transform_points(T_view_common, xyz))
+        beyond = transform_points(T_view_common, xyz + BEYOND_M * outward)
+        there = placed.sight.behind(beyond)
+        here = placed.facing(xyz, normal, FACING) & (behind > -NEARER_M) & (behind < FARTHER_M)
         seen += here
         free += here & (there > MARGIN_M)
     ends = free >= np.maximum(FREE_SHARE * seen, 1.0)
     return np.where(seen > 0, np.where(ends, 0, 1), -1)
-
-
-def _behind(sight: Sight, points: Float) -> Float:
-    """How much farther away than points (n, 3) the item is along their rays, m."""
-    place, depth = sight.grid.to_grid(points)
-    row, col = (np.rint(place).astype(np.int64) - sight.low).T
-    rows, cols = sight.depth.shape
-    inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-    there = sight.depth[row.clip(0, rows - 1), col.clip(0, cols - 1)]
-    behind: Float = np.where(inside, there, np.inf) - depth
-    return behind

@@ -289,6 +289,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "correspondence_rejected": "a corresponding point contradicts the others",
     "coarse_points": "the points are noisier, or farther apart, than the method is set for",
     "smoothed_depth": "the depth was smoothed over, which joins layers: turn its filters off",
+    "looked_past": "points where other views see nothing were taken away",
     "fat_edges": "stereo has made edges wider: what it added was taken off",
     "views_misplaced": "the views do not fit together, or a print on the cloth says so",
     "axis_off": "the item turned about another axis than the calibration has",

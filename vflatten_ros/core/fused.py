@@ -190,16 +190,16 @@ def _registered(
     turned = as_they_turn(views, surfaces, poses, config, progress)
     poses = turned.poses
     grain, apart_m = _told_by_all(surfaces, poses, config)
-    share, there = _looked_past(surfaces, poses, apart_m, config)
-    if share:
-        rows, notices = there, (past_notice(share),)
+    px, within = _edges(views, surfaces, poses, config, grain)
+    if px:
+        rows, notices = within, (fat_notice(px),)
         seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
         surfaces, poses = anew(0.0)
         grain, apart_m = _told_by_all(surfaces, poses, config)
-    px, within = _edges(seen, surfaces, poses, config, grain)
-    if px:
-        rows = within if rows is None else [r[w] for r, w in zip(rows, within, strict=True)]
-        notices = (*notices, fat_notice(px))
+    share, there = _looked_past(surfaces, poses, apart_m, config)
+    if share:
+        rows = there if rows is None else [r[k] for r, k in zip(rows, there, strict=True)]
+        notices = (*notices, past_notice(share))
         seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
         surfaces, poses = anew(0.0)
         grain, apart_m = _told_by_all(surfaces, poses, config)

@@ -13,6 +13,7 @@ from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.fused import fuse_views
 from vflatten_ros.core.looked_past import (
     NOTED,
+    borne_out,
     looked_past,
     notice_of,
     share_looked_past,
@@ -132,6 +133,26 @@ def test_the_share_of_some_points_tells_that_of_all():
     assert told == pytest.approx(np.concatenate(past(surfaces)).mean(), rel=0.25)
 
 
+def test_of_views_that_do_not_fit_together_nothing_is_taken():
+    _, surfaces = specked()
+    random = np.random.default_rng(5)
+    poses = [np.eye(4) for _ in surfaces]
+    for pose in poses:
+        pose[:2, 3] = random.normal(0.0, 0.1, 2)
+    assert np.concatenate(looked_past(surfaces, poses, APART_M)).mean() > 0.3
+    assert borne_out(surfaces, poses, APART_M) == (0.0, [])
+
+
+def test_a_view_of_which_hardly_anything_is_borne_out_is_left():
+    view = column(0.0, 0)
+    view = dataclasses.replace(view, points_rig=0.9 * view.points_rig)
+    _, surfaces = with_view(0, view)
+    share, rows = borne_out(surfaces, [np.eye(4)] * len(surfaces), APART_M)
+    assert 0.02 < share < 0.05
+    assert (rows[0] == surfaces[0].index).all()
+    assert all(len(r) > 0.9 * len(s.index) for r, s in zip(rows, surfaces, strict=True))
+
+
 def test_what_is_looked_past_leaves_no_samples():
     seen, surfaces = specked()
     prepared = dict(enumerate(surfaces))
@@ -152,4 +173,4 @@ def test_a_clean_rotation_is_left_as_it_is():
 
 
 def test_the_notice_says_how_much():
-    assert "7%" in notice_of(0.07).text
+    assert "7.0%" in notice_of(0.07).text

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vflatten_ros.core import looked_past
 from vflatten_ros.core.config import CorrespondenceConfig, IntegrationConfig, RotationConfig
 from vflatten_ros.core.correspondences import NOTHING_GIVEN, Judged, judged, place_view
 from vflatten_ros.core.edges import inside_edges, pixels_to_edge, with_rows
@@ -15,8 +16,6 @@ from vflatten_ros.core.fat_edges import notice_of as fat_notice
 from vflatten_ros.core.fusion import Points, Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.grain import Grain, borne_out, notices_of, suited, typical
-from vflatten_ros.core.looked_past import NOTED, looked_past, share_looked_past
-from vflatten_ros.core.looked_past import notice_of as past_notice
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.registration import (
     Folded,
@@ -199,7 +198,7 @@ def _registered(
     share, there = _looked_past(surfaces, poses, apart_m, config)
     if share:
         rows = there if rows is None else [r[k] for r, k in zip(rows, there, strict=True)]
-        notices = (*notices, past_notice(share))
+        notices = (*notices, looked_past.notice_of(share))
         seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
         surfaces, poses = anew(0.0)
         grain, apart_m = _told_by_all(surfaces, poses, config)
@@ -220,17 +219,10 @@ def _looked_past(
     apart_m: float,
     config: RotationConfig,
 ) -> tuple[float, list[Int]]:
-    """Share of the points where there is nothing, and the rows of each view's others.
-
-    A share of 0 if it is so small that fits of the surface bear it.
-    """
+    """Share of the points where there is nothing, and the rows of each view's others."""
     if not config.trim_edges or any(surface.sight is None for surface in surfaces):
         return 0.0, []
-    if share_looked_past(surfaces, poses, apart_m) < NOTED:
-        return 0.0, []
-    past = looked_past(surfaces, poses, apart_m)
-    share = float(np.concatenate(past).mean())
-    return share, [s.index[~gone] for s, gone in zip(surfaces, past, strict=True)]
+    return looked_past.borne_out(surfaces, poses, apart_m)
 
 
 def _edges(

@@ -17,7 +17,7 @@ from vflatten_ros.core.geometry import inverse, transform_directions, transform_
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.registration import ViewSurface
 from vflatten_ros.core.sight import PlacedSight, Sight
-from vflatten_ros.core.values import Bool, Float, Notice
+from vflatten_ros.core.values import Bool, Float, Int, Notice
 
 PAST_M = 0.004  # behind a point, from which on a view looks past it
 PAST_SPREADS = 3.0  # or so many standard deviations of surfaces of different views
@@ -27,6 +27,38 @@ MOST = 0.5  # share of the views that tell, above which it is one
 FARTHEST_M = 1e9  # beyond any item: a view shows nothing there
 LOOKED_AT = 8  # every so many-th point tells how many there are
 NOTED = 0.002  # share of such points that fits of the surface bear
+TOO_MANY = 0.3  # share above which it is the views that do not fit together
+FEWEST_LEFT = 100  # points of a view
+
+
+def borne_out(
+    surfaces: Sequence[ViewSurface], poses: Sequence[Float], apart_m: float
+) -> tuple[float, list[Int]]:
+    """Rows of each view's points without those where there is nothing, if that is worth while.
+
+    Parameters
+    ----------
+    surfaces : sequence of ViewSurface
+    poses : sequence of ndarray of shape (4, 4)
+    apart_m : float
+        As looked_past.
+
+    Returns
+    -------
+    share : float
+        Of the points, that is looked past; 0 if it is so small that fits bear it, or so large that
+        the views do not fit together: then all are to be kept.
+    rows : list of ndarray of shape (n,)
+        Of the points of each view; all that its surface has, if hardly any were left.
+    """
+    if not NOTED <= share_looked_past(surfaces, poses, apart_m) <= TOO_MANY:
+        return 0.0, []
+    past = looked_past(surfaces, poses, apart_m)
+    rows = [
+        s.index[~gone] if (~gone).sum() >= FEWEST_LEFT else s.index
+        for s, gone in zip(surfaces, past, strict=True)
+    ]
+    return float(np.concatenate(past).mean()), rows
 
 
 def share_looked_past(
@@ -98,6 +130,6 @@ def notice_of(share: float) -> Notice:
     """Says that points were taken away."""
     return Notice(
         "looked_past",
-        f"{share:.0%} of the points lie where other views see nothing, as stereo finds depths by "
+        f"{share:.1%} of the points lie where other views see nothing, as stereo finds depths by "
         "chance beside edges and where nothing is to match: taken away",
     )

@@ -12,7 +12,8 @@ from vflatten_ros.core.geometry import rigid
 from vflatten_ros.core.slide import neighbours
 
 ANGLES = (-0.5, -0.25, 0.0, 0.25, 0.5)
-CONFIG, PRINTS = RotationConfig(), CorrespondenceConfig()
+# the ends of a view that was slid are looked past by the others, which is another matter
+CONFIG, PRINTS = RotationConfig(trim_edges=False), CorrespondenceConfig()
 
 
 def views(colour):

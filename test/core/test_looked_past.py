@@ -13,7 +13,7 @@ from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.fused import fuse_views
 from vflatten_ros.core.looked_past import (
     NOTED,
-    borne_out,
+    kept_rows,
     looked_past,
     notice_of,
     share_looked_past,
@@ -63,7 +63,7 @@ def specked(specks=4):
     return seen, [view_surface(view, RotationConfig()) for view in seen]
 
 
-def off_m(points_rig, angle_rad=0.0):
+def off_m(points_rig):
     """How far points are from the column, m."""
     return np.abs(np.hypot(points_rig[:, 0], points_rig[:, 2] - 1.3) - RADIUS_M)
 
@@ -140,14 +140,14 @@ def test_of_views_that_do_not_fit_together_nothing_is_taken():
     for pose in poses:
         pose[:2, 3] = random.normal(0.0, 0.1, 2)
     assert np.concatenate(looked_past(surfaces, poses, APART_M)).mean() > 0.3
-    assert borne_out(surfaces, poses, APART_M) == (0.0, [])
+    assert kept_rows(surfaces, poses, APART_M) == (0.0, [])
 
 
 def test_a_view_of_which_hardly_anything_is_borne_out_is_left():
     view = column(0.0, 0)
     view = dataclasses.replace(view, points_rig=0.9 * view.points_rig)
     _, surfaces = with_view(0, view)
-    share, rows = borne_out(surfaces, [np.eye(4)] * len(surfaces), APART_M)
+    share, rows = kept_rows(surfaces, [np.eye(4)] * len(surfaces), APART_M)
     assert 0.02 < share < 0.05
     assert (rows[0] == surfaces[0].index).all()
     assert all(len(r) > 0.9 * len(s.index) for r, s in zip(rows, surfaces, strict=True))

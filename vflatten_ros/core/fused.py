@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vflatten_ros.core import looked_past
 from vflatten_ros.core.config import CorrespondenceConfig, IntegrationConfig, RotationConfig
 from vflatten_ros.core.correspondences import NOTHING_GIVEN, Judged, judged, place_view
 from vflatten_ros.core.edges import inside_edges, pixels_to_edge, with_rows
@@ -16,6 +15,8 @@ from vflatten_ros.core.fat_edges import notice_of as fat_notice
 from vflatten_ros.core.fusion import Points, Samples, fuse
 from vflatten_ros.core.geometry import transform_directions, transform_points
 from vflatten_ros.core.grain import Grain, borne_out, notices_of, suited, typical
+from vflatten_ros.core.looked_past import kept_rows
+from vflatten_ros.core.looked_past import notice_of as past_notice
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.registration import (
     Folded,
@@ -169,9 +170,11 @@ def _registered(
 ) -> _Registered:
     """Surface and pose of each view, in the hanger frame of the axis about which they turn.
 
-    Anew, where together they tell of fat edges, or of more noise than any one of them shows.
+    Anew, where together they tell of fat edges, of points where there is nothing, or of more noise
+    than any one of them shows.
     """
-    seen, rows, notices = list(views), None, tuple[Notice, ...]()
+    seen = list(views)
+    rows: list[Int] = [np.arange(len(view.points_rig)) for view in views]
 
     def surface(view: View) -> ViewSurface:
         return prepared.get(view.view_id) or view_surface(view, config, features)
@@ -188,59 +191,62 @@ def _registered(
     poses = register_views(surfaces, config, progress, so_far)
     turned = as_they_turn(views, surfaces, poses, config, progress)
     poses = turned.poses
+    notices = turned.notices
     grain, apart_m = _told_by_all(surfaces, poses, config)
-    px, within = _edges(views, surfaces, poses, config, grain)
-    if px:
-        rows, notices = within, (fat_notice(px),)
-        seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
-        surfaces, poses = anew(0.0)
-        grain, apart_m = _told_by_all(surfaces, poses, config)
-    share, there = _looked_past(surfaces, poses, apart_m, config)
-    if share:
-        rows = there if rows is None else [r[k] for r, k in zip(rows, there, strict=True)]
-        notices = (*notices, looked_past.notice_of(share))
-        seen = [with_rows(view, kept) for view, kept in zip(views, rows, strict=True)]
+    for told in (_edges, _looked_past) if config.trim_edges else ():
+        notice, kept = told(_Placed(seen, surfaces, poses, grain, apart_m), config)
+        if notice is None:
+            continue
+        notices = (*notices, notice)
+        rows = [of_view[k] for of_view, k in zip(rows, kept, strict=True)]
+        seen = [with_rows(view, k) for view, k in zip(seen, kept, strict=True)]
         surfaces, poses = anew(0.0)
         grain, apart_m = _told_by_all(surfaces, poses, config)
     noisier = borne_out(grain, apart_m)
     if suited(config, noisier) != suited(config, grain):
         surfaces, poses = anew(noisier.noise_m)
-    if rows is not None:
-        pairs = zip(surfaces, rows, strict=True)
-        surfaces = [replace(surface, index=kept[surface.index]) for surface, kept in pairs]
-    notices = turned.notices + notices
+    pairs = zip(surfaces, rows, strict=True)
+    surfaces = [replace(surface, index=of_view[surface.index]) for surface, of_view in pairs]
     poses = [turned.T_hanger_common @ pose for pose in poses]
     return _Registered(surfaces, poses, apart_m, turned.calibration, notices)
 
 
-def _looked_past(
-    surfaces: Sequence[ViewSurface],
-    poses: Sequence[Float],
-    apart_m: float,
-    config: RotationConfig,
-) -> tuple[float, list[Int]]:
-    """Share of the points where there is nothing, and the rows of each view's others."""
-    if not config.trim_edges or any(surface.sight is None for surface in surfaces):
-        return 0.0, []
-    return looked_past.borne_out(surfaces, poses, apart_m)
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """Registered views, and what they tell of their points together."""
+
+    views: Sequence[View]
+    surfaces: Sequence[ViewSurface]
+    poses: Sequence[Float]  # (4, 4) each: takes its hanger coordinates to the common ones
+    grain: Grain
+    apart_m: float  # of the surfaces of overlapping views
+
+    @property
+    def by_cameras(self) -> bool:
+        """Whether all of the clouds are images."""
+        return all(surface.sight is not None for surface in self.surfaces)
 
 
-def _edges(
-    views: Sequence[View],
-    surfaces: Sequence[ViewSurface],
-    poses: Sequence[Float],
-    config: RotationConfig,
-    grain: Grain,
-) -> tuple[int, list[Int]]:
-    """By how many pixels edges are fat, and the rows of each view's points without those."""
-    if not config.trim_edges or any(surface.sight is None for surface in surfaces):
-        return 0, []
-    to_edge = [pixels_to_edge(view, grain.pitch_m) for view in views]
-    at_points = [near[s.index] for near, s in zip(to_edge, surfaces, strict=True)]
-    px = fat_px(surfaces, poses, at_points, config, grain.pitch_m)
+def _edges(placed: _Placed, config: RotationConfig) -> tuple[Notice | None, list[Int]]:
+    """Rows of each view's points without fat edges, and what to say; None: there are none."""
+    if not placed.by_cameras:
+        return None, []
+    pitch_m = placed.grain.pitch_m
+    to_edge = [pixels_to_edge(view, pitch_m) for view in placed.views]
+    at_points = [near[s.index] for near, s in zip(to_edge, placed.surfaces, strict=True)]
+    px = fat_px(placed.surfaces, placed.poses, at_points, config, pitch_m)
     if not px:
-        return 0, []
-    return px, [inside_edges(v, near, px) for v, near in zip(views, to_edge, strict=True)]
+        return None, []
+    pairs = zip(placed.views, to_edge, strict=True)
+    return fat_notice(px), [inside_edges(view, near, px) for view, near in pairs]
+
+
+def _looked_past(placed: _Placed, config: RotationConfig) -> tuple[Notice | None, list[Int]]:
+    """The same without points where there is nothing."""
+    if not placed.by_cameras:
+        return None, []
+    share, kept = kept_rows(placed.surfaces, placed.poses, placed.apart_m)
+    return (past_notice(share) if share else None), kept
 
 
 def _told_by_all(

@@ -25,13 +25,13 @@ FACING = 0.3  # least cosine between the normal and the direction to a camera th
 FEWEST = 2  # views that look past a point with nothing there
 MOST = 0.5  # share of the views that tell, above which it is one
 FARTHEST_M = 1e9  # beyond any item: a view shows nothing there
-LOOKED_AT = 8  # every so many-th point tells how many there are
+LOOKED_AT = 20  # every so many-th point tells how many there are
 NOTED = 0.002  # share of such points that fits of the surface bear
 TOO_MANY = 0.3  # share above which it is the views that do not fit together
 FEWEST_LEFT = 100  # points of a view
 
 
-def borne_out(
+def kept_rows(
     surfaces: Sequence[ViewSurface], poses: Sequence[Float], apart_m: float
 ) -> tuple[float, list[Int]]:
     """Rows of each view's points without those where there is nothing, if that is worth while.

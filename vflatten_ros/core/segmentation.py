@@ -313,7 +313,7 @@ def _held(
 
 
 def _specks_m2(area: Float) -> float:
-    """Up to which area pieces are noise, by their number: an item hangs in a few.
+    """Up to which area pieces, of areas (n,) in m2, are noise by their number: an item has few.
 
     Where stereo has nothing to match, it finds depths by chance, for patches of some size.
     """

@@ -6,6 +6,7 @@ SHELL := bash
 BAG ?= bags/SH1_1
 PROTOCOL ?=
 PYTHON ?= python3
+JOBS ?= 2
 
 # Runs what follows in the built package's environment.
 IN_ENV := source env.sh;
@@ -23,8 +24,8 @@ demo: bootstrap  ## Flatten a recorded garment: a table, and figures in build/de
 	  --json build/demo/result.json --figures build/demo
 	@echo "figures in build/demo: $$(cd build/demo; echo *.png)"
 
-test: bootstrap  ## All tests, on the built package (TESTS="test/core -k plane" for some)
-	@$(IN_ENV) VFLATTEN_REQUIRE_ROS=1 pytest $(TESTS)
+test: bootstrap  ## All tests, on the built package (TESTS="test/core -k plane" for some; JOBS=1: one at a time)
+	@$(IN_ENV) VFLATTEN_REQUIRE_ROS=1 pytest --numprocesses $(JOBS) --dist loadfile $(TESTS)
 
 check: bootstrap  ## Lint and types
 	@$(IN_ENV) ruff check
@@ -58,11 +59,12 @@ docs: bootstrap  ## Regenerate docs/parameters.md from the defaults in the code
 # Keeps the pins that still fit; UPGRADE=1 moves to the newest versions.
 COMPILE := ../build/uv/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
   --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
+DEBIANS := $(addprefix --no-emit-package ,numpy pytest iniconfig packaging pluggy pygments)
 lock:  ## Pin all requirements anew, transitive ones and hashes included
 	@$(PYTHON) -m venv build/uv
 	@build/uv/bin/pip install --quiet --disable-pip-version-check uv==0.13.9
 	@cd requirements; $(COMPILE) runtime.in dev.in ros.in --output-file wheels.txt
-	@cd requirements; $(COMPILE) beside-ros.in --constraint wheels.txt --no-emit-package numpy --output-file beside-ros.txt
+	@cd requirements; $(COMPILE) beside-ros.in --constraint wheels.txt $(DEBIANS) --output-file beside-ros.txt
 	@cd requirements; $(COMPILE) peers.in --constraint wheels.txt --output-file peers.txt
 
 clean:  ## Remove everything that was built

@@ -28,6 +28,11 @@ from vflatten_ros.msg import Correspondence, Status, ViewBufferState
 from vflatten_ros.srv import AddCorrespondences, GetState, LocateLandmark
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+ATTEMPTS = 5  # where another planner begins a new item between our last view and our goal
+
+
+class NoViews(RuntimeError):
+    """The views were gone, or too few, when they were to be flattened."""
 
 
 class Planner(Node):
@@ -117,8 +122,26 @@ class Planner(Node):
         handle = self.wait(self._flatten.send_goal_async(goal, self._on_feedback), 10.0)
         answer = self.wait(handle.get_result_async(), limit_s)
         if answer.status != GoalStatus.STATUS_SUCCEEDED:
-            raise RuntimeError(f"flatten: {answer.result.status.message}")
+            status = answer.result.status
+            error = NoViews if status.code == Status.NO_VIEWS else RuntimeError
+            raise error(f"flatten: {status.message}")
         return answer.result
+
+    def gather_and_flatten(
+        self, player: subprocess.Popen[bytes] | None, protocol: dict[str, Any], method: str
+    ) -> Any:
+        """The result; with the views of the next rotation if those of this one are gone."""
+        wanted = max(protocol["views"], default=0) + 1 if "pairs" in protocol else None
+        for attempt in range(ATTEMPTS):
+            self.gather(player, wanted)
+            if "pairs" in protocol:
+                self.add_correspondences(protocol)
+            try:
+                return self.flatten(method, list(protocol["views"]))
+            except NoViews as error:
+                if player is not None or attempt + 1 == ATTEMPTS:
+                    raise
+                print(f"{error}; gathering again", flush=True)
 
     def _on_feedback(self, message: Any) -> None:
         feedback = message.feedback
@@ -176,11 +199,8 @@ def main() -> int:
             command = [sys.executable, "-m", "vflatten_ros.player", str(args.recording)]
             command += ["--rate", str(args.rate), "--quiet"]
             player = subprocess.Popen([*command, "--ros-args", "-r", f"__ns:={args.namespace}"])
-        planner.gather(player, max(protocol["views"], default=0) + 1 if by_hand else None)
-        if by_hand:
-            planner.add_correspondences(protocol)
         method = args.method or ("kita2019" if by_hand else "")
-        result = planner.flatten(method, list(protocol["views"]))
+        result = planner.gather_and_flatten(player, protocol, method)
         report(planner, result)
         if args.save:
             save(result, args.save)

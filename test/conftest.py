@@ -20,14 +20,16 @@ collect_ignore = [] if HAS_ROS or os.environ.get("VFLATTEN_REQUIRE_ROS") else ["
 
 
 def pytest_configure() -> None:
-    # Neither another test run nor a robot on the network hears this one.
+    # Neither another process of the tests, another run, nor a robot on the network hears this one.
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
-def pytest_report_header() -> str:
+def pytest_report_header(config: pytest.Config) -> str:
     if not HAS_ROS:
         return "ROS: none, the tests under test/ros are left out"
+    if config.getoption("numprocesses", None):
+        return "ROS: a domain for each process"
     return f"ROS: domain {os.environ['ROS_DOMAIN_ID']}"
 
 

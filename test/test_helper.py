@@ -28,9 +28,10 @@ from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.helper import HelperProcess
 from vflatten_ros.processes import SETTINGS
 
+COARSE = {"spacing_m": 0.012, "link_m": 0.0264, "landmarks": 80}  # soon done, and all ways tried
 CONFIG = dataclasses.replace(
-    Config(), rotation=dataclasses.replace(Config().rotation, draw=2)
-)  # with which the best way of the item is one that the helper tries
+    Config(), rotation=dataclasses.replace(Config().rotation, draw=2, **COARSE)
+)  # the best way of the item is one that the helper tries
 TEMPLATES = load_templates()
 READY_S = 60.0
 
@@ -53,12 +54,12 @@ def alike(a, b, path=""):
 
 
 class Item:
-    """An item that needs all ways, seen by some views; what it is by one process."""
+    """An item that needs all ways, as it is looked at; what it is by one process."""
 
     def __init__(self):
-        folder = BAGS / "TR1_1"
+        folder = BAGS / "SK2_1"
         rig = load_calibration(calibration_beside(folder))
-        self.views = gather_views(open_recording(folder), rig, CONFIG).views()[::3]
+        self.views = gather_views(open_recording(folder), rig, CONFIG).views()
         self.prepared = {view.view_id: prepare_view(view, CONFIG) for view in self.views}
         self.tried = []
         self.alone = self.flattened(None, lambda stage, _: self.tried.append(stage))

@@ -18,6 +18,7 @@ from vflatten_ros.core.registration import (
     disagreement_m,
     fold_in,
     register_views,
+    turned,
     view_surface,
 )
 from vflatten_ros.core.values import Calibration, View
@@ -144,3 +145,24 @@ def test_pairs_grow_with_the_views_not_with_their_square():
     assert len(pairs(100)) == 100 * 2 * registration.MOST_PARTNERS
     first = {j for i, j in pairs(100) if i == 0}
     assert {1, 99, 13, 87} <= first  # the nearest and, 47 degrees away, the farthest
+
+
+def test_a_surface_at_another_angle_about_another_axis_is_what_its_view_would_give():
+    view = views_of([(np.zeros(3), 0.0)], noise_m=0.0005)[0]
+    other = replace(
+        CALIBRATION,
+        axis_point=tuple(np.add(CALIBRATION.axis_point, [0.02, 0.0, 0.03])),
+        axis_direction=(0.0, -np.cos(0.1), np.sin(0.1)),
+        joint_sign=-CALIBRATION.joint_sign,
+    )
+    angle = view.angle_rad - 0.7
+    expected = view_surface(replace(view, calibration=other, angle_rad=angle), RotationConfig())
+    T_rig_old = CALIBRATION.T_rig_hanger(view.angle_rad)
+    T_new_old = inverse(other.T_rig_hanger(angle)) @ T_rig_old
+    surface = view_surface(view, RotationConfig())
+    found = turned(surface, T_new_old, angle)
+    assert np.abs(surface.points - expected.points).max() > 0.05
+    for name in ("points", "smooth", "normals", "camera", "index", "angle_rad"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
+    np.testing.assert_array_equal(found.tree.data, found.smooth)
+    assert found.sight is None

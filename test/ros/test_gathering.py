@@ -183,22 +183,25 @@ def test_bag_time_that_begins_anew_begins_one_item(ros, tmp_path):
 
 
 def test_planners_as_processes_at_once_each_get_a_result(rig, tmp_path):
+    """Whatever the other one does meanwhile: each begins a new item before and after."""
     player = rig.play("--rate", 8, "--loop", wait=False)
-    rig.until(lambda: len(rig.buffer().views) > 3, "some views")
-    processes = [
-        Process(
-            [
-                "examples/planner.py",
-                str(CALIBRATION.parent),
-                *("--node", f"{rig.namespace}/vflatten", "--no-play", "--method", "rotation"),
-            ],
-            tmp_path / f"planner{number}.log",
-        )
-        for number in range(2)
-    ]
-    for process in processes:
-        assert process.wait() == 0, process.log()
-        assert "towel (quality" in process.log()
-        assert "begins" in process.log()
-    player.kill()
+    try:
+        rig.until(lambda: len(rig.buffer().views) > 3, "some views")
+        processes = [
+            Process(
+                [
+                    "examples/planner.py",
+                    str(CALIBRATION.parent),
+                    *("--node", f"{rig.namespace}/vflatten", "--no-play", "--method", "rotation"),
+                ],
+                tmp_path / f"planner{number}.log",
+            )
+            for number in range(2)
+        ]
+        for process in processes:
+            assert process.wait() == 0, process.log()
+            assert "towel (quality" in process.log()
+            assert "begins" in process.log()
+    finally:
+        player.kill()
     rig.serves_a_good_rotation()

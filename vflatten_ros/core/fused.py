@@ -189,7 +189,7 @@ def _registered(
 
     surfaces = _each(surface, seen, progress)
     poses = register_views(surfaces, config, progress, so_far)
-    turned = as_they_turn(views, surfaces, poses, config, progress)
+    turned = as_they_turn(views[0].calibration, surfaces, poses, config, progress)
     poses = turned.poses
     notices = turned.notices
     grain, apart_m = _told_by_all(surfaces, poses, config)

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.features import NO_FEATURES, Features, features_of
-from vflatten_ros.core.geometry import Float, inverse, transform_points
+from vflatten_ros.core.geometry import Float, inverse, transform_directions, transform_points
 from vflatten_ros.core.grain import Grain, grain_of, suited, typical
 from vflatten_ros.core.motions import (
     AXIS,
@@ -115,6 +115,36 @@ def view_surface(
         grain,
         sight_of(points, view.pixel, view.shape),
         features_of(view, smooth, row) if prints else NO_FEATURES,
+    )
+
+
+def turned(surface: ViewSurface, T_new_old: Float, angle_rad: float) -> ViewSurface:
+    """The same surface, had the view been taken at another angle or about another axis.
+
+    Parameters
+    ----------
+    surface : ViewSurface
+    T_new_old : ndarray of shape (4, 4)
+        Takes its hanger coordinates to those that the other angle and axis give.
+    angle_rad : float
+        The other angle.
+
+    Returns
+    -------
+    ViewSurface
+        Without sight, which no registration asks for.
+    """
+    smooth = transform_points(T_new_old, surface.smooth)
+    return replace(
+        surface,
+        angle_rad=angle_rad,
+        points=transform_points(T_new_old, surface.points),
+        smooth=smooth,
+        normals=transform_directions(T_new_old, surface.normals),
+        camera=transform_points(T_new_old, surface.camera),
+        tree=cKDTree(smooth),
+        sight=None,
+        features=surface.features.turned(T_new_old),
     )
 
 

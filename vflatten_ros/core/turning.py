@@ -24,6 +24,7 @@ from vflatten_ros.core.registration import (
     ViewSurface,
     agreement,
     register_views,
+    turned,
     view_surface,
 )
 from vflatten_ros.core.values import Calibration, Float, Notice, Progress, View, no_progress
@@ -59,7 +60,7 @@ class Turned:
 
 
 def as_they_turn(
-    views: Sequence[View],
+    given: Calibration,
     surfaces: Sequence[ViewSurface],
     poses: Sequence[Float],
     config: RotationConfig,
@@ -69,9 +70,10 @@ def as_they_turn(
 
     Parameters
     ----------
-    views : sequence of View
+    given : Calibration
+        Of the views.
     surfaces : sequence of ViewSurface
-        Of these.
+        Of them, by it.
     poses : sequence of ndarray of shape (4, 4)
         Result of register_views for them.
     config : RotationConfig
@@ -82,11 +84,10 @@ def as_they_turn(
     InvalidCalibration
         They turn the other way, or not at all.
     """
-    given = views[0].calibration
     poses, error, suiting = _about_true_axis(surfaces, poses, config, progress)
     agreed = agreement(surfaces, poses, config)
     as_given = Turned(list(poses), suiting, given, np.eye(4))
-    if not agreed.enough and (otherwise := _contradiction(views, agreed, config)):
+    if not agreed.enough and (otherwise := _contradiction(given, surfaces, agreed, config)):
         raise InvalidCalibration(otherwise)
     if agreed.hopeless:
         return replace(as_given, notices=_misplaced(agreed))
@@ -127,16 +128,18 @@ def refine_axis(
         The views fit together neither way.
     """
     given = views[0].calibration
-    found = _refined(views, config, progress)
+    progress("axis", 0.0)
+    surfaces = list(mapped(partial(view_surface, config=config), views))
+    found = _refined(given, surfaces, config, progress)
     if not found.agreement.least:
         raise NotEnoughViews(
             f"calibration: {len(views)} views, and hardly two of them near each other in angle; "
             "turn the item once and take a view every 30 degrees or oftener"
         )
     if not found.agreement.enough:
-        if _agreement_if_still(views, config).plainly_more_than(found.agreement):
+        if _agreement_if_still(given, surfaces, config).plainly_more_than(found.agreement):
             raise InvalidCalibration(_still(given))
-        other = _refined([_reversed(view) for view in views], config, progress)
+        other = _refined(*_reversed(given, surfaces), config, progress)
         found = other if other.agreement.plainly_more_than(found.agreement) else found
     if found.agreement.hopeless:
         raise InvalidCalibration(f"{_neither(found.agreement)}, or measure the axis again")
@@ -177,12 +180,16 @@ def apart(given: Calibration, found: Calibration) -> tuple[float, float]:
     return float(np.linalg.norm(away)), float(lean)
 
 
-def _contradiction(views: Sequence[View], agreed: Agreement, config: RotationConfig) -> str:
+def _contradiction(
+    given: Calibration, surfaces: Sequence[ViewSurface], agreed: Agreement, config: RotationConfig
+) -> str:
     """What else the views say of how the item turns, where little of their cloth lies on itself.
 
     Parameters
     ----------
-    views : sequence of View
+    given : Calibration
+    surfaces : sequence of ViewSurface
+        Of the views, by it.
     agreed : Agreement
         Of these, registered as the joint has them.
     config : RotationConfig
@@ -192,16 +199,15 @@ def _contradiction(views: Sequence[View], agreed: Agreement, config: RotationCon
     str
         Empty where they fit together no better any other way.
     """
-    calibration = views[0].calibration
-    if _agreement_if_still(views, config).plainly_more_than(agreed):
-        return _still(calibration)
-    surfaces = [view_surface(_reversed(view), config) for view in views]
-    other = agreement(surfaces, register_views(surfaces, config), config)
+    if _agreement_if_still(given, surfaces, config).plainly_more_than(agreed):
+        return _still(given)
+    _, other_way = _reversed(given, surfaces)
+    other = agreement(other_way, register_views(other_way, config), config)
     if other.plainly_more_than(agreed):
         return (
             f"the views fit together if the item turns the other way ({other.share:.0%} of "
             f"neighbouring views' cloth lies on itself, {agreed.share:.0%} as it is): set "
-            f"joint_sign to {-calibration.joint_sign:g} in the calibration"
+            f"joint_sign to {-given.joint_sign:g} in the calibration"
         )
     return ""
 
@@ -263,18 +269,19 @@ def _about_true_axis(
     return poses, error, rough
 
 
-def _refined(views: Sequence[View], config: RotationConfig, progress: Progress) -> Axis:
+def _refined(
+    given: Calibration, seen: Sequence[ViewSurface], config: RotationConfig, progress: Progress
+) -> Axis:
     """The axis in rounds: each begins where the last one left it."""
     rough = _rough(config)
     reaching = replace(rough, register_reach_m=ROUGH_REACH_M)
-    calibration, near, best = views[0].calibration, False, 0.0
+    calibration, near, best = given, False, 0.0
     for done in range(ROUNDS):
         progress("axis", done / ROUNDS)
-        now = [replace(view, calibration=calibration) for view in views]
-        surfaces = list(mapped(partial(view_surface, config=config), now))
+        surfaces = [_by(calibration, given, surface, surface.angle_rad) for surface in seen]
         poses = register_views(surfaces, rough if near else reaching)
         agreed = agreement(surfaces, poses, config)
-        error = axis_error([view.angle_rad for view in views], poses, rough)
+        error = axis_error([surface.angle_rad for surface in seen], poses, rough)
         calibration = corrected(calibration, error)
         small = np.hypot(*error[:2]) < FOUND_RAD and np.hypot(*error[2:]) < FOUND_M
         if (near and small) or (done >= FEWEST and agreed.share <= best):
@@ -283,19 +290,32 @@ def _refined(views: Sequence[View], config: RotationConfig, progress: Progress) 
     return Axis(calibration, 0.0, 0.0, agreed)
 
 
-def _reversed(view: View) -> View:
-    """The view, had the item turned the other way."""
-    calibration = replace(view.calibration, joint_sign=-view.calibration.joint_sign)
-    return replace(view, calibration=calibration, angle_rad=-view.angle_rad)
+def _by(
+    calibration: Calibration, given: Calibration, surface: ViewSurface, angle_rad: float
+) -> ViewSurface:
+    """A surface that is by the given calibration, by another one and at another angle."""
+    T_rig_hanger = given.T_rig_hanger(surface.angle_rad)
+    T_new_old = inverse(calibration.T_rig_hanger(angle_rad)) @ T_rig_hanger
+    return turned(surface, T_new_old, angle_rad)
 
 
-def _agreement_if_still(views: Sequence[View], config: RotationConfig) -> Agreement:
+def _reversed(
+    given: Calibration, surfaces: Sequence[ViewSurface]
+) -> tuple[Calibration, list[ViewSurface]]:
+    """Calibration and surfaces, had the item turned the other way."""
+    other = replace(given, joint_sign=-given.joint_sign)
+    return other, [_by(other, given, surface, -surface.angle_rad) for surface in surfaces]
+
+
+def _agreement_if_still(
+    given: Calibration, surfaces: Sequence[ViewSurface], config: RotationConfig
+) -> Agreement:
     """As if the item had not turned at all."""
-    surfaces = [
-        replace(view_surface(replace(view, angle_rad=0.0), config), angle_rad=view.angle_rad)
-        for view in views
+    still = [
+        replace(_by(given, given, surface, 0.0), angle_rad=surface.angle_rad)
+        for surface in surfaces
     ]
-    return agreement(surfaces, [np.eye(4)] * len(views), config)
+    return agreement(still, [np.eye(4)] * len(still), config)
 
 
 def _still(calibration: Calibration) -> str:

@@ -200,6 +200,33 @@ def test_three_times_the_noise_is_seen_to():
     assert not untrusted(garment)
 
 
+def cropped(view, rows):
+    """The view had the image fewer rows."""
+    kept = view.pixel[:, 0] < rows
+    points, pixel = view.points_rig[kept], view.pixel[kept]
+    return dataclasses.replace(
+        view, points_rig=points, pixel=pixel, rgb=None, shape=(rows, view.shape[1])
+    )
+
+
+@pytest.mark.slow
+def test_an_item_that_hangs_out_of_the_image_is_not_trusted():
+    """The lowest 17 cm of shorts: where the image ends, the cloth does not."""
+    rig = load_calibration(calibration_beside(BAGS / "SH1_1"))
+    views = gather_views(open_recording(BAGS / "SH1_1"), rig, ALL_VIEWS).views()
+    views = [cropped(view, 165) for view in views[::2]]
+    garment = pipeline.flatten_garment(views, (), load_templates(), ONE_WAY)
+    codes = {notice.code for notice in garment.notices}
+    assert {"truncated", "untrusted", "unseen"} <= codes and not garment.enough
+    (text,) = (notice.text for notice in garment.notices if notice.code == "truncated")
+    assert "the lower one in 12 of 12 views" in text
+    category, wrong = errors(garment, BAGS / "SH1_1")
+    assert garment.category == category
+    length = garment.measurement("length")
+    true_m = length.value_m / (1.0 + wrong[1]), length.value_m / (1.0 - wrong[1])
+    assert min(abs(length.value_m - m) for m in true_m) < 2.0 * length.sigma_m
+
+
 def fattened(view, camera, px):
     """Pixels beside edges get the depth of what is in front, as stereo gives it."""
     row, col = view.pixel.T

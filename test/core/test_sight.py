@@ -94,6 +94,17 @@ def test_beyond_the_image_a_view_tells_nothing():
     assert abs(behind[0]) < 0.002 and np.isnan(behind[1]) and np.isinf(behind[2])
 
 
+def test_a_sheet_does_not_end_where_the_image_does():
+    whole, cut = image(SHEET, ELSEWHERE), image((0.1, 0.4, AWAY_M), ELSEWHERE)
+    edge = 159.5 / FOCAL_PX * AWAY_M
+    xyz = ends(edge)
+    assert (told(cut, xyz=xyz) == 1).all()
+    looks_past = PlacedSight(whole, rigid(np.eye(3), np.array([edge, 0.0, 0.0])))
+    tile = np.ones((len(xyz), 1))
+    placed = [PlacedSight(cut, np.eye(4)), looks_past]  # a view that shows it ending there
+    assert (goes_on(xyz, tile * TOWARDS, tile * RIGHT, placed) == 0).all()
+
+
 def test_parallel_rays():
     rays = parallel_rays(
         np.array([-0.15, -0.1, 0.0]), np.array([0, 0.002, 0]), np.array([0.002, 0, 0]), (100, 150)

@@ -15,6 +15,7 @@ from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.fused import fuse_views
 from vflatten_ros.core.grain import suited, too_noisy
 from vflatten_ros.core.hypotheses import Helper, likeliest
+from vflatten_ros.core.image_border import cut_off
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.one_view import flatten_one_view
@@ -254,11 +255,15 @@ def _described(
     )
     if automatic and recognition.fit is not None and recognition.category != UNKNOWN:
         outline = with_category(outline, recognition.fit, config.recognition.misfit_m)
-    told = {notice.code for notice in flattened.notices}
+    shown = [view for view in views if view.view_id in used]
+    notices = flattened.notices
+    for more in (cut_off(shown), measured.notices):
+        told = {notice.code for notice in notices}
+        notices += tuple(notice for notice in more if notice.code not in told)
     garment = FlatGarment(
         method=config.method,
         view_ids=tuple(used),
-        stamp_ns=max(v.stamp_ns for v in views if v.view_id in used),
+        stamp_ns=max(view.stamp_ns for view in shown),
         points=points,
         start_uv=flattened.start_uv,
         lines=flattened.lines,
@@ -273,17 +278,19 @@ def _described(
         coverage=measured.coverage,
         quality=measured.quality,
         calibration=flattened.calibration or views[0].calibration,
-        notices=flattened.notices + tuple(n for n in measured.notices if n.code not in told),
+        notices=notices,
     )
     if recognition.fit is not None and recognition.category != UNKNOWN:
         garment = upright(garment, recognition.fit.pose)
     if flattened.seen is None:
         return garment
     unseen = advice(garment, flattened.seen, config.measurement.low_coverage)
-    more = () if unseen is None else (notice_of(unseen),)
+    if unseen is not None:
+        beyond = "truncated" in {notice.code for notice in notices}
+        notices = (*notices, notice_of(unseen, beyond))
     garment = replace(
         garment,
-        notices=garment.notices + more,
+        notices=notices,
         shares=flattened.seen.shares,
         unseen=unseen,
     )

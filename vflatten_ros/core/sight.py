@@ -117,6 +117,6 @@ def goes_on(xyz: Float, normal: Float, outward: Float, sights: Sequence[PlacedSi
         there = placed.sight.behind(beyond)
         here = placed.facing(xyz, normal, FACING) & (behind > -NEARER_M) & (behind < FARTHER_M)
         seen += here
-        free += here & ~(there <= MARGIN_M)  # what is beyond the image counts as nothing
+        free += here & (there > MARGIN_M)  # not what lies beyond the image: there may be cloth
     ends = free >= np.maximum(FREE_SHARE * seen, 1.0)
     return np.where(seen > 0, np.where(ends, 0, 1), -1)

@@ -147,9 +147,11 @@ def advice(garment: FlatGarment, seen: Coverage, low_coverage: float) -> Unseen 
     return Unseen(seen.turn_to_rad) if missing else None
 
 
-def notice_of(unseen: Unseen) -> Notice:
-    """The advice in words."""
-    if unseen.turn_to_rad is None:
+def notice_of(unseen: Unseen, cut_off: bool = False) -> Notice:
+    """The advice in words; views may have cut the item off."""
+    if unseen.turn_to_rad is None and cut_off:
+        text = "turning cannot show what no view shows: it lies beyond the image, or in folds"
+    elif unseen.turn_to_rad is None:
         text = "turning cannot show what no view shows: it lies in folds; grasp the item elsewhere"
     else:
         degrees = np.degrees(unseen.turn_to_rad)

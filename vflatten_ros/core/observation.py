@@ -8,9 +8,11 @@ import cv2
 import numpy as np
 
 from vflatten_ros.core.config import Config
+from vflatten_ros.core.edges import with_rows
 from vflatten_ros.core.errors import InvalidCorrespondence
 from vflatten_ros.core.patches import find_patches
 from vflatten_ros.core.surface import Surface, fit_surface
+from vflatten_ros.core.thinning import thinned
 from vflatten_ros.core.values import Bool, Float, Int, Progress, View
 
 GRAZING = 0.25  # cosine of the angle between ray and normal beyond which the cloth turns away
@@ -35,11 +37,14 @@ class Observation:
 
 
 def observe(view: View, config: Config, progress: Progress) -> Observation:
-    """Fit the surface of a view and part it into smooth patches."""
+    """Fit the surface of a view and part it into smooth patches; see thinned for its points."""
+    smaller, needed = thinned(view, config.rotation)
+    if smaller is not view:
+        view = with_rows(view, needed)  # its pixels are those of the whole image
     points = view.points_hanger
     toward = _camera(view) - points
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    pixel, shape = (view.pixel, view.shape) if view.shape[0] > 1 else (None, None)
+    pixel, shape = (smaller.pixel, smaller.shape) if view.shape[0] > 1 else (None, None)
     surface = fit_surface(points, config.surface, toward, pixel, shape, progress)
     at, depth = surface.rays.to_grid(points)
     place: Int = np.rint(at).astype(np.int64)

@@ -33,6 +33,7 @@ from vflatten_ros.core.motions import (
 )
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.sight import Sight, sight_of
+from vflatten_ros.core.thinning import thinned
 from vflatten_ros.core.turntable import TURN
 from vflatten_ros.core.values import Int, Progress, View, no_progress
 
@@ -73,7 +74,8 @@ def view_surface(
 ) -> ViewSurface:
     """Local planes of one view's points. Needs no other view: do it as the view arrives.
 
-    Points with too few neighbours for a plane (flying pixels, shreds) are left out.
+    Points with too few neighbours for a plane (flying pixels, shreds) are left out, and whole rows
+    and columns of an image that is finer than the config is for.
 
     Parameters
     ----------
@@ -90,6 +92,7 @@ def view_surface(
         The view has hardly any points on the item.
     """
     T_hanger_rig = inverse(view.calibration.T_rig_hanger(view.angle_rad))
+    view, needed = thinned(view, config)
     points = transform_points(T_hanger_rig, view.points_rig)
     if len(points) < MIN_POINTS:
         raise NotEnoughViews(
@@ -109,7 +112,7 @@ def view_surface(
         points[row],
         smooth,
         normals[row],
-        row,
+        needed[row],
         camera,
         cKDTree(smooth),
         grain,

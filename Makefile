@@ -25,7 +25,7 @@ demo: bootstrap  ## Flatten a recorded garment: a table, and figures in build/de
 	@echo "figures in build/demo: $$(cd build/demo; echo *.png)"
 
 test: bootstrap  ## All tests, on the built package (TESTS="test/core -k plane" for some; JOBS=1: one at a time)
-	@$(IN_ENV) VFLATTEN_REQUIRE_ROS=1 pytest --numprocesses $(JOBS) --dist loadfile $(TESTS)
+	@$(IN_ENV) VFLATTEN_REQUIRE_ROS=1 pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
 check: bootstrap  ## Lint and types
 	@$(IN_ENV) ruff check

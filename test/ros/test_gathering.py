@@ -1,8 +1,12 @@
 """What becomes of every cloud: each reason to drop one, as a planner and an operator see it."""
 
+import runpy
+import types
+
 import numpy as np
+import pytest
 from lifecycle_msgs.msg import Transition
-from ros_rig import CALIBRATION, Process, Rig
+from ros_rig import CALIBRATION, ROOT, Process, Rig
 from sensor_msgs.msg import JointState, PointCloud2, PointField
 
 from vflatten_ros.core.events import DROP_REASONS, REMEDIES
@@ -180,6 +184,36 @@ def test_bag_time_that_begins_anew_begins_one_item(ros, tmp_path):
         assert rig.diagnostics()["buffer"]["clock jumps"] == "1"
     finally:
         rig.close()
+
+
+class Impatient:
+    """A planner whose views are gone some times when they are to be flattened."""
+
+    def __init__(self, example, gone):
+        self.example, self.gone, self.gathered = example, gone, 0
+
+    def gather(self, player, wanted):
+        self.gathered += 1
+
+    def flatten(self, method, view_ids):
+        if self.gathered <= self.gone:
+            raise self.example.NoViews("flatten: the buffer holds no views")
+        return "result"
+
+
+def test_the_planner_gathers_again_where_its_views_are_gone():
+    example = runpy.run_path(str(ROOT / "examples" / "planner.py"))
+    example = types.SimpleNamespace(**example)
+    again = Impatient(example, gone=2)
+    gather_and_flatten = example.Planner.gather_and_flatten
+    assert gather_and_flatten(again, None, {"views": []}, "rotation") == "result"
+    assert again.gathered == 3
+    with pytest.raises(example.NoViews):
+        gather_and_flatten(Impatient(example, gone=99), None, {"views": []}, "rotation")
+    turned_it_itself = Impatient(example, gone=1)
+    with pytest.raises(example.NoViews):  # nobody turns it once more
+        gather_and_flatten(turned_it_itself, object(), {"views": []}, "rotation")
+    assert turned_it_itself.gathered == 1
 
 
 def test_planners_as_processes_at_once_each_get_a_result(rig, tmp_path):

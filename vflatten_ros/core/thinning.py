@@ -16,7 +16,7 @@ from vflatten_ros.core.values import Int, View
 
 APART = 8  # points of a row by which their pitch is measured: noise hardly counts
 FACING = 0.25  # share of the points, at least, that face the camera
-FINEST = 0.75  # of the pitch that the method is for: those that are left are as far apart
+FINER = 0.75  # of the pitch that the method is for, at most, from one that is left to the next
 LEAST_M = 1e-5  # pitch
 
 
@@ -63,4 +63,4 @@ def _step_px(view: View, config: RotationConfig) -> int:
     together = in_row & (across[:, 1] == away)
     apart_m = np.linalg.norm(points[APART:] - points[:-APART], axis=1)[together]
     pitch_m = max(float(np.quantile(apart_m, FACING)) / away, LEAST_M)
-    return max(1, int(FINEST * config.pitch_m / pitch_m))
+    return max(1, int(FINER * config.pitch_m / pitch_m))

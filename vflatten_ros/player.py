@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -191,13 +192,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"vflatten play: {error}", file=sys.stderr)
         return 1
     transport.use_profile()
-    rclpy.init(args=given[at:], signal_handler_options=SignalHandlerOptions.ALL)
+    # rclpy's handlers shut the context down from another thread, perhaps while it is published
+    rclpy.init(args=given[at:], signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as SIGINT
     node = Node("vflatten_player")
     try:
         return _play(node, recording, args)
     except KeyboardInterrupt:
         return 130
     finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)  # it ends already
         node.destroy_node()
         rclpy.try_shutdown()
 

@@ -165,11 +165,13 @@ class Worker:
             self._send(view)
 
     def stop(self) -> None:
-        """End the process."""
+        """End the process, and the threads that speak with it."""
         self._generation += 1
         self._outbox.put(None)
         self._process.kill()
         self._process.join(timeout=5.0)
+        for thread in self._threads:
+            thread.join(timeout=5.0)
 
     def _start(self) -> None:
         context = get_context("spawn")
@@ -181,9 +183,13 @@ class Worker:
         self._process.start()
         theirs.close()
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        for run in (self._write, self._read):
-            args = (ours, self._process, self._outbox, self._generation)
-            threading.Thread(target=run, args=args, daemon=True).start()
+        args = (ours, self._process, self._outbox, self._generation)
+        self._threads = [
+            threading.Thread(target=run, args=args, daemon=True)
+            for run in (self._write, self._read)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def _write(self, pipe: Connection, _: Any, outbox: queue.SimpleQueue[Any], __: int) -> None:
         for message in iter(outbox.get, None):

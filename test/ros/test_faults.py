@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -216,6 +217,21 @@ def test_a_node_killed_in_mid_rotation_serves_after_its_restart(shared_rig, tmp_
         # two rigs side by side: the other one has heard nothing of this
         assert shared_rig.diagnostics()["clouds"]["received"] == before
         assert rig.node.stop(signal.SIGTERM) == 0
+        with pytest.raises(ProcessLookupError):
+            os.kill(worker, 0)
+    finally:
+        rig.close()
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_the_end_waits_for_the_callback_at_hand(ros, tmp_path, how):
+    busy = [str(Path(__file__).parent / "busy_node.py")]
+    rig = Rig(tmp_path, kind=busy, arguments=["--calibration", str(CALIBRATION)], wait=False)
+    try:
+        rig.until(lambda: rig.node.log().endswith("begins\n"), "a callback")
+        (worker,) = rig.node.children()
+        assert rig.node.stop(how) == 0
+        assert rig.node.log().endswith("ended\n")  # no traceback, and nothing begun anew
         with pytest.raises(ProcessLookupError):
             os.kill(worker, 0)
     finally:

@@ -26,7 +26,9 @@ from vflatten_ros.core.events import (
     ItemStarted,
     RotationComplete,
     ViewAdded,
+    ViewReplaced,
 )
+from vflatten_ros.core.image_border import cut_off_now
 from vflatten_ros.core.values import Calibration, FlatGarment
 from vflatten_ros.files import load_calibration
 from vflatten_ros.frames import Frames
@@ -244,6 +246,14 @@ class FlattenNode(AnsweringLifecycleNode):
             self.log.warning(text, cause="clock")
         elif isinstance(event, CloudDropped) and event.reason not in ("duplicate_angle", "cleared"):
             self.log.warning(self._drop_line(event), cause=event.reason)
+        elif isinstance(event, ViewAdded | ViewReplaced):
+            self._look_at_border(event.view_id)
+
+    def _look_at_border(self, view_id: int) -> None:
+        """Warn while the item turns, not only with the result."""
+        view = self.session.views().get(view_id) if self.session is not None else None
+        if view is not None and (text := cut_off_now(view)):
+            self.log.warning(f"view {view_id}: {text}", cause="truncated")
 
     def _drop_line(self, event: CloudDropped) -> str:
         remedy = f"; {REMEDIES[event.reason]}" if event.reason in REMEDIES else ""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from column import CALIBRATION
 
-from vflatten_ros.core.image_border import cut_off
+from vflatten_ros.core.image_border import cut_off, cut_off_now
 from vflatten_ros.core.values import View
 
 SHAPE = (100, 80)
@@ -102,3 +102,9 @@ def test_in_a_frame_that_is_no_cameras_below_is_no_side():
 def test_unorganised_clouds_have_no_border():
     view = dataclasses.replace(strip(0, (0, 0), (0, 500)), shape=(1, 501))
     assert cut_off([view]) == ()
+
+
+def test_one_view_is_told_as_it_arrives():
+    assert cut_off_now(strip(0, (20, 60), (30, 50))) == ""
+    assert "the lower and right border" in cut_off_now(strip(0, (20, 98), (30, 79)))
+    assert cut_off_now(strip(0, (0, 0), (0, 50), (1, 80))) == ""  # unorganised

@@ -126,6 +126,15 @@ def test_every_reason_to_drop_a_cloud_is_counted_reported_and_explained(rig):
     rig.serves_a_good_rotation()
 
 
+def test_an_item_that_fills_the_image_is_told_as_it_arrives(rig):
+    reactivate(rig)
+    arm = Turning(rig)
+    arm.turn(2.0, rate=0.5)
+    arm.see(2.0)
+    assert "the item reaches the upper and lower and left and right border" in rig.node.log()
+    reactivate(rig)
+
+
 def test_a_flood_of_mistakes_does_not_flood_the_log(rig):
     reactivate(rig)
     lines = len(rig.node.log().splitlines())

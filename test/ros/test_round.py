@@ -78,6 +78,7 @@ def test_the_planners_round_gives_what_replay_gives(ros, tmp_path, method, rate,
         assert rig.node.stop() == 0
         assert all(gone(helper) for helper in helpers)
         assert "helper" not in rig.node.log()  # it had no trouble
+        assert "border of the image" not in rig.node.log()  # the item is within it
     finally:
         rig.close()
 

@@ -15,6 +15,7 @@ LINE_PX = 10  # that show its lower end in the last row in which any view does: 
 FEWEST_VIEWS = 3  # to tell a straight cut from a straight hem
 LEAST_ACROSS = 0.5  # of the axis' direction, across the view, for the frame to be that of an image
 OFTEN = 0.5  # share of the views; what so many cut off, the others hardly show
+REMEDY = "what lies beyond was not seen; move the camera back, or aim it at the whole item"
 
 
 def cut_off(views: Sequence[View]) -> tuple[Notice, ...]:
@@ -44,8 +45,7 @@ def cut_off(views: Sequence[View]) -> tuple[Notice, ...]:
     notices = [
         Notice(
             "truncated",
-            f"the item reaches the border of the image, {named} of {len(images)} views: what lies "
-            "beyond was not seen; move the camera back, or aim it at the whole item",
+            f"the item reaches the border of the image, {named} of {len(images)} views: {REMEDY}",
         )
     ]
     most = int(count.argmax())
@@ -53,6 +53,14 @@ def cut_off(views: Sequence[View]) -> tuple[Notice, ...]:
         text = f"the item goes on beyond the {SIDES[most]} border of the image"
         notices.append(Notice("untrusted", text))
     return tuple(notices)
+
+
+def cut_off_now(view: View) -> str:
+    """The same of one view, as it arrives; empty: nothing to say."""
+    if view.shape[0] < 2 or not len(view.pixel):
+        return ""
+    sides = " and ".join(SIDES[k] for k in np.flatnonzero(_at_border(view)))
+    return f"the item reaches the {sides} border of the image: {REMEDY}" if sides else ""
 
 
 def _to_sides(view: View) -> Int:

@@ -20,6 +20,17 @@ from vflatten_ros.core.recognition import Recognition
 from vflatten_ros.core.tried import Tried
 
 
+def part(creased):
+    """Landmarks in a row, of which a share of the pairs lies half as far apart as on the cloth."""
+    plane = np.column_stack([0.01 * np.arange(40.0), np.zeros(40)])
+    bound = np.abs(plane[:, 0] - plane[:, :1])
+    near = np.triu(np.ones(bound.shape, dtype=bool), 1)
+    row, col = np.argwhere(near)[: round(creased * near.sum())].T
+    bound[row, col] *= 2.0
+    distances = SimpleNamespace(bound_m=bound, same_sheet=near)
+    return SimpleNamespace(plane=plane, distances=distances)
+
+
 def tried(
     share=1.0,
     overlap=0.0,
@@ -36,6 +47,7 @@ def tried(
     hidden=0.0,
     torn_m=0.0,
     cloth=0.9,
+    creased=0.0,
 ):
     """A towel of 0.4 x 0.4 m, or what is said of it; its upper edge may lie further in.
 
@@ -58,7 +70,7 @@ def tried(
         outline=outline,
         points=points,
         side=np.where(np.arange(1000) % 2, 1.0, -1.0),
-        parts=(None,) * parts,
+        parts=(part(0.0),) * (parts - 1) + (part(creased),),
     )
     points.xyz_hanger[::2, 2] += torn_m
     found = SimpleNamespace(
@@ -114,6 +126,15 @@ def test_a_way_that_tears_the_seams_of_its_category_is_worse():
     assert tried(torn_m=0.01).torn == tried().torn == 0.0
     assert tried(torn_m=0.2).torn == 1.0
     assert tried(torn_m=0.2).badness > tried().badness + 1.0
+
+
+def test_a_way_that_gives_way_along_many_creases_is_worse_but_not_hopeless():
+    assert tried(creased=0.03).badness == tried().badness
+    assert tried(creased=0.05).badness == pytest.approx(tried().badness + 0.3, abs=0.02)
+    assert tried(creased=0.05, parts=2).creased == pytest.approx(0.05, abs=0.001)
+    round_tube = tried(creased=0.2)
+    assert round_tube.badness == pytest.approx(tried().badness + 0.8)
+    assert not tried(creased=0.2, misfit=-0.7).untrusted
 
 
 def test_cloth_that_is_hidden_between_parts_counts_and_makes_sizes_uncertain():

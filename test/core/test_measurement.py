@@ -11,11 +11,13 @@ from flat import lying_at
 
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import MeasurementConfig, RecognitionConfig
+from vflatten_ros.core.held_end import held_end_below
 from vflatten_ros.core.measurement import measure
 from vflatten_ros.core.recognition import recognise
 from vflatten_ros.core.values import FlatPoints, Outline
 
 WIDTH_M, LENGTH_M, STEP_M = 0.34, 0.60, 0.005
+CONFIG = RecognitionConfig()
 TOWEL = tuple(t for t in load_templates() if t.category == "towel")
 
 
@@ -141,8 +143,13 @@ def test_a_landmark_on_a_part_that_may_lie_turned_over_hangs_there_or_there():
             assert mark == before[name]
 
 
-def test_the_corners_of_a_rectangle_may_be_named_the_other_way_round():
-    result, _ = measured()
+def test_the_corners_of_a_towel_held_by_its_middle_may_be_named_the_other_way_round():
+    outline = rectangle(top_seen=True)
+    points = hanging(cloth(2), (WIDTH_M / 2, LENGTH_M / 2))
+    found = held_end_below(recognise(outline, points, TOWEL, CONFIG), outline, points, CONFIG)
+    result = measure(found, outline, points, MeasurementConfig())
+    (text,) = [notice.text for notice in result.notices if notice.code == "ends_alike"]
+    assert "may be exchanged" in text
     certainty = {mark.name: mark.certainty for mark in result.landmarks}
     assert certainty.pop("centre") > 0.9
     assert len(certainty) == 4
@@ -167,3 +174,37 @@ def test_the_ends_of_a_skirt_that_flares_are_told_apart():
     result = measure(found, outline, some, MeasurementConfig())
     assert "ends_alike" not in codes(result)
     assert max(mark.certainty for mark in result.landmarks) > 0.6
+
+
+def hanging(points, corner):
+    """The points as they hang from a place of the flat item, straight down."""
+    away = np.linalg.norm(points.uv - corner, axis=1)
+    none = np.zeros_like(away)
+    return dataclasses.replace(points, xyz_hanger=np.column_stack([none, none, -away]))
+
+
+@pytest.mark.parametrize(
+    "corner", [(0.0, 0.0), (WIDTH_M, 0.0), (0.0, LENGTH_M), (WIDTH_M, LENGTH_M)]
+)
+def test_the_end_of_a_towel_at_the_gripper_is_the_bottom_one(corner):
+    outline, points = rectangle(top_seen=True), hanging(cloth(24), corner)
+    found = held_end_below(recognise(outline, points, TOWEL, CONFIG), outline, points, CONFIG)
+    result = measure(found, outline, points, MeasurementConfig())
+    marks = {mark.name: mark for mark in result.landmarks}
+    away = {name: np.linalg.norm(np.array(mark.uv) - corner) for name, mark in marks.items()}
+    assert min(away, key=away.get) in ("left_bottom_corner", "right_bottom_corner")
+    assert min(away.values()) < 0.01
+    assert marks["left_top_corner"].certainty > 0.6  # by convention: no doubt which is meant
+    sizes = {size.name: size.value_m for size in result.measurements}
+    assert sizes["width"] == pytest.approx(WIDTH_M, abs=0.003)
+    assert sizes["length"] == pytest.approx(LENGTH_M, abs=0.003)
+    (text,) = [notice.text for notice in result.notices if notice.code == "ends_alike"]
+    assert "the one at the gripper is called bottom" in text
+
+
+@pytest.mark.parametrize("corner", [(0.0, 0.0), (WIDTH_M, LENGTH_M)])
+def test_the_waist_of_a_skirt_is_not_a_matter_of_the_hold(corner):
+    outline, points = rectangle(top_seen=True), hanging(cloth(24), corner)
+    skirt = tuple(t for t in load_templates() if t.category == "skirt")
+    found = recognise(outline, points, skirt, CONFIG)
+    assert held_end_below(found, outline, points, CONFIG) is found

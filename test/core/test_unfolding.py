@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.unfolding import carry, orientation, place_samples, settle, unfold
+from vflatten_ros.core.unfolding import carry, creased, orientation, place_samples, settle, unfold
 
 CONFIG = RotationConfig(unfold_rounds=8)
 
@@ -38,6 +38,33 @@ def test_a_tube_creases_to_half_its_girth():
     extent = np.ptp(aligned(plane, np.c_[np.zeros(300), at[:, 1]]), axis=0)
     assert extent[0] == pytest.approx(girth / 2, rel=0.08)
     assert extent[1] == pytest.approx(np.ptp(at[:, 1]), rel=0.03)
+
+
+def test_a_round_tube_creases_sharply():
+    """It is one sheet all around: only pairs across two lines give way, and nothing stretches."""
+    girth, height = 0.6, 0.3
+    at = plane_of(300, girth, height, seed=7)
+    along = np.abs(at[:, None, 0] - at[None, :, 0])
+    bound = np.hypot(np.minimum(along, girth - along), at[:, None, 1] - at[None, :, 1])
+    near = bound < 0.25
+    plane = unfold(bound, near, CONFIG)
+    flat = np.linalg.norm(plane[:, None] - plane[None], axis=2)
+    assert (flat - bound)[near].max() < 0.008
+    extent = np.ptp(aligned(plane, np.c_[np.zeros(300), at[:, 1]]), axis=0)
+    assert extent[0] == pytest.approx(girth / 2, rel=0.02)
+    assert extent[1] == pytest.approx(np.ptp(at[:, 1]), rel=0.02)
+    assert 0.1 < creased(plane, bound, near) < 0.3
+
+
+def test_a_sheet_has_no_creases_and_one_folded_over_has():
+    true = plane_of(200, 0.3, 0.4)
+    bound = np.linalg.norm(true[:, None] - true[None], axis=2)
+    assert creased(true, bound, bound < 0.15) == 0.0
+    folded = np.c_[np.abs(true[:, 0] - 0.15), true[:, 1]]
+    across = (true[:, None, 0] < 0.15) != (true[None, :, 0] < 0.15)
+    share = creased(folded, bound, bound < 0.15)
+    assert 0.5 * across[bound < 0.15].mean() < share < across[bound < 0.15].mean()
+    assert creased(true, bound, np.zeros_like(across)) == 0.0
 
 
 def test_some_wrong_bounds_that_are_too_long_do_no_harm():

@@ -28,7 +28,7 @@ from vflatten_ros.core.rotation import (
     unfolded_from,
 )
 from vflatten_ros.core.sheets import Links
-from vflatten_ros.core.unfolding import SPREAD, orientation, settle
+from vflatten_ros.core.unfolding import SOFTLY, SPREAD, orientation, settle
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 SMALLEST = 0.01  # share of the samples that makes a piece
@@ -177,7 +177,7 @@ def unfold_group(
     )
     bound, near = distances.bound_m, distances.same_sheet
     plane = _begun(grouped.places, samples.xyz, mask, distances.chosen)
-    plane = settle(plane, bound, near, config, SPREAD[-1])
+    plane = settle(plane, bound, near, config, SPREAD[-1], SOFTLY)
     progress("outline", 0.0)
     return unfolded_from(surface, Part(distances, plane), config)
 

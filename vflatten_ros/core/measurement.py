@@ -16,6 +16,7 @@ from vflatten_ros.core.values import FlatPoints, Int, Landmark, Measurement, Not
 
 CELL_M = 0.01  # of the area counted as seen
 ALIKE_M = 0.01  # between an outline and itself after half a turn, that cannot be told apart
+HELD_M = 0.03  # from the middle of such an item to where it is held, that tells its ends apart
 FEW = 2  # views from which outlines err along whole edges
 
 
@@ -62,7 +63,7 @@ def measure(
         landmarks=landmarks(fit, points, recognition.probabilities[recognition.category], config),
         coverage=coverage,
         quality=quality,
-        notices=_notices(recognition, fit, measurements, coverage, quality, config),
+        notices=_notices(recognition, fit, points, measurements, coverage, quality, config),
     )
 
 
@@ -155,6 +156,8 @@ def landmarks(
     seen = np.nonzero(~points.inferred)[0]
     tree = cKDTree(points.uv[seen]) if len(seen) else None
     middle = half_turn_about(fit)
+    if middle is not None and named_by_hold(fit, points, middle):
+        middle = None
     result = []
     for name, i in fit.template.landmarks.items():
         moved = middle is not None and np.linalg.norm(placed[i] - middle) > ALIKE_M
@@ -182,6 +185,24 @@ def half_turn_about(fit: Fit) -> Float | None:
     turned = 2 * middle - outline
     off = [abs(cv2.pointPolygonTest(line, (float(u), float(v)), True)) for u, v in turned]
     return middle if max(off) < ALIKE_M else None
+
+
+def held_above_m(fit: Fit, points: FlatPoints, middle: Float) -> float:
+    """How far up from the middle of the flat item the gripper holds it, m; 0 if nothing was seen.
+
+    Up is from the category's bottom to its top.
+    """
+    seen = np.flatnonzero(~points.inferred)
+    if not len(seen):
+        return 0.0
+    held = points.uv[seen[np.linalg.norm(points.xyz_hanger[seen], axis=1).argmin()]]
+    up = np.array([-np.sin(fit.pose[0]), np.cos(fit.pose[0])])
+    return float((held - middle) @ up)
+
+
+def named_by_hold(fit: Fit, points: FlatPoints, middle: Float) -> bool:
+    """Whether its hold tells which of two ends that look alike is called bottom: see held_end."""
+    return fit.template.single_sheet and held_above_m(fit, points, middle) < -HELD_M
 
 
 def _landmark(
@@ -256,6 +277,7 @@ def _quality(
 def _notices(
     recognition: Recognition,
     fit: Fit,
+    points: FlatPoints,
     measurements: tuple[Measurement, ...],
     coverage: float,
     quality: float,
@@ -276,8 +298,13 @@ def _notices(
     if len(order) > 1 and order[1][1] > 0.2:
         text = f"{order[0][0]} {order[0][1]:.2f}, {order[1][0]} {order[1][1]:.2f}"
         notices.append(Notice("category_uncertain", text))
-    if half_turn_about(fit) is not None:
-        text = f"{recognition.category}: both ends look alike, their names may be exchanged"
+    middle = half_turn_about(fit)
+    if middle is not None:
+        by_hold = named_by_hold(fit, points, middle)
+        named = (
+            "the one at the gripper is called bottom" if by_hold else "their names may be exchanged"
+        )
+        text = f"{recognition.category}: both ends look alike, {named}"
         notices.append(Notice("ends_alike", text))
     if quality < config.trusted_quality:
         notices.append(Notice("untrusted", f"quality {quality:.2f}: do not use the sizes"))

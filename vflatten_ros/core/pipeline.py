@@ -14,6 +14,7 @@ from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.fused import fuse_views
 from vflatten_ros.core.grain import suited, too_noisy
+from vflatten_ros.core.held_end import held_end_below
 from vflatten_ros.core.hypotheses import Helper, likeliest
 from vflatten_ros.core.image_border import cut_off
 from vflatten_ros.core.measurement import measure
@@ -242,6 +243,7 @@ def _described(
         progress("recognition", 0.0)
         flattened, recognition = _recognised(flattened, tuple(templates), config, progress)
     points, outline = flattened.points, flattened.outline
+    recognition = held_end_below(recognition, outline, points, config.recognition)
     progress("measurement", 0.0)
     measured = measure(recognition, outline, points, config.measurement)
     automatic = config.method == "rotation"

@@ -23,6 +23,7 @@ from vflatten_ros.core.sheets import Links, link_samples, outward, sheet_edges
 from vflatten_ros.core.sight import PlacedSight, goes_on
 from vflatten_ros.core.slits import slits
 from vflatten_ros.core.unfolding import (
+    SOFTLY,
     carry,
     orientation,
     overlap,
@@ -203,7 +204,7 @@ def laid_flat(
     alone = links.among(piece)
     everywhere = np.ones(len(rows), dtype=bool)
     distances = surface_distances(xyz, normal, alone, everywhere, rough, progress)
-    plane = unfold(distances.bound_m, distances.same_sheet, rough, progress)
+    plane = unfold(distances.bound_m, distances.same_sheet, rough, progress, SOFTLY)
     uv = place_samples(distances.around, distances.around_m, distances.around_sheet, plane)[0]
     places = np.full((len(piece), 2), np.nan)
     places[rows[distances.inside]] = uv[distances.inside]

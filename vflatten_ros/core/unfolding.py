@@ -8,6 +8,7 @@ somewhere; and otherwise the points spread. No panels, seams or correspondences 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +22,20 @@ UPON_FAR_M = 0.08  # ... if they are this far apart along the cloth
 STAY = 1e-6  # weight of the present distance of every pair: keeps the equations regular
 BLOCK = 4096  # samples placed at a time, so that they stay in the cache
 SPREAD = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # weight of distances that fall short, in turn
+# How far a near pair may fall short before it hardly counts, as a share of its distance, in turn.
+# Round the side of a tube the cloth is one sheet, and where it creases is found by the pairs that
+# give way: the fewer and the wholly, the sharper the crease (Blake and Zisserman 1987)
+CREASING = (0.2, 0.1, 0.05)
+SOFTLY = CREASING[:1]  # for pieces whose edges are the creases
+CREASED = 0.2  # share of its distance by which a near pair falls short across a crease
 
 
 def unfold(
-    bound: Float, near: Bool, config: RotationConfig, progress: Progress = no_progress
+    bound: Float,
+    near: Bool,
+    config: RotationConfig,
+    progress: Progress = no_progress,
+    creasing: Sequence[float] = CREASING,
 ) -> Float:
     """Plane coordinates that keep the bounds, keep near distances, and spread otherwise.
 
@@ -34,6 +45,10 @@ def unfold(
         Distances along the surface.
     near : ndarray of shape (k, k)
         Pairs that keep their distance both ways.
+    config : RotationConfig
+    progress : Progress
+    creasing : sequence of float
+        How sharply the cloth creases in the end; see CREASING.
 
     Returns
     -------
@@ -41,22 +56,40 @@ def unfold(
         Metres; position, rotation and mirror image are arbitrary but repeatable.
     """
     plane, aims = _classical_scaling(bound), _aims(bound, near)
-    rounds = [spread for spread in SPREAD for _ in range(config.unfold_rounds)]
-    for done, spread in enumerate(rounds):
+    turns = [(spread, creasing[0]) for spread in SPREAD]
+    turns += [(SPREAD[-1], slack) for slack in creasing[1:]]
+    rounds = [turn for turn in turns for _ in range(config.unfold_rounds)]
+    for done, (spread, slack) in enumerate(rounds):
         progress("unfold", done / len(rounds))
-        plane = _majorise(plane, aims, spread)
+        plane = _majorise(plane, aims, spread, slack)
     return plane
 
 
 def settle(
-    plane: Float, bound: Float, near: Bool, config: RotationConfig, spread: float = 0.0
+    plane: Float,
+    bound: Float,
+    near: Bool,
+    config: RotationConfig,
+    spread: float = 0.0,
+    creasing: Sequence[float] = CREASING[-1:],
 ) -> Float:
     """Keep bounds and near distances, from where the points are, without spreading much more."""
     centre, aims = plane.mean(0), _aims(bound, near)
-    for _ in range(config.unfold_rounds):
-        plane = _majorise(plane, aims, spread)
+    for slack in creasing:
+        for _ in range(config.unfold_rounds):
+            plane = _majorise(plane, aims, spread, slack)
     settled: Float = plane + centre
     return settled
+
+
+def creased(plane: Float, bound: Float, near: Bool) -> float:
+    """Share of the near pairs that fall short as across a crease.
+
+    A garment laid flat has few, or none where its seams are sharp. More mean that it gave way where
+    distances contradict each other.
+    """
+    apart = _pairwise(plane)[near]
+    return float((apart < (1.0 - CREASED) * bound[near]).mean()) if len(apart) else 0.0
 
 
 def overlap(plane: Float, bound: Float, up: Float) -> float:
@@ -110,22 +143,22 @@ class _Aims:
     near: Bool  # (k, k)
     base: Float  # (k, k) weight of a pair
     stay: Float  # (k, k) of its present distance
-    slack: Float  # (k, k) how far a near pair may fall short
+    safe: Float  # (k, k) the bounds, 1 where there is none
 
 
 def _aims(bound: Float, near: Bool) -> _Aims:
     safe = np.where(bound > 0, bound, 1.0)
     base = (bound > 0) / safe**1.5
-    return _Aims(bound, near, base, STAY * base, 0.2 * safe)
+    return _Aims(bound, near, base, STAY * base, safe)
 
 
-def _majorise(plane: Float, aims: _Aims, spread: float) -> Float:
+def _majorise(plane: Float, aims: _Aims, spread: float, slack: float) -> Float:
     """Three steps of stress majorisation (de Leeuw 1977) under weights taken from the residuals."""
     k = len(plane)
     bound, base = aims.bound, aims.base
     flat = _pairwise(plane)
     short = np.maximum(bound - flat, 0.0)
-    robust = short / aims.slack
+    robust = short / (slack * aims.safe)
     robust *= robust
     robust += 1.0
     np.maximum(np.divide(1.0, robust, out=robust), spread, out=robust)

@@ -283,7 +283,8 @@ NOTICE_CODES: Mapping[str, str] = {
     "low_coverage": "much of the item was not seen",
     "hidden_crease": "a deep crease probably hides cloth",
     "category_uncertain": "two categories fit nearly as well",
-    "ends_alike": "turned by half a turn the item looks the same: its ends' names may be exchanged",
+    "ends_alike": "turned by half a turn the item looks the same: a towel's end at the gripper is "
+    "called bottom, others' names may be exchanged",
     "solution_uncertain": "the item may lie otherwise, with another width or length",
     "turned_over": "a part may lie turned over: what is on it may be mistaken for its opposite",
     "correspondence_rejected": "a corresponding point contradicts the others",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import garments
 import numpy as np
 import pytest
 import sheet
@@ -146,3 +147,12 @@ def test_features_are_left_out_on_request():
     placed = placed_views(VIEWS[2:4], config, no_progress, {})
     assert len(corresponding(*placed, config)) >= 8
     assert fill_up((VIEWS[2], VIEWS[3]), config, no_progress) == corresponding(*placed, config)
+
+
+def test_a_towels_end_at_the_gripper_is_called_bottom():
+    towel = tuple(t for t in TEMPLATES if t.category == "towel")
+    garment = flatten_garment(garments.example_views(), (), towel, CONFIG)
+    height = {mark.name: mark.xyz_hanger[2] for mark in garment.landmarks}  # the tip is at 0
+    for side in ("left", "right"):
+        assert height[f"{side}_bottom_corner"] == pytest.approx(-garments.BELOW_TIP_M, abs=0.02)
+        assert height[f"{side}_top_corner"] < -garments.HEIGHT_M

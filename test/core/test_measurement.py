@@ -208,3 +208,6 @@ def test_the_waist_of_a_skirt_is_not_a_matter_of_the_hold(corner):
     skirt = tuple(t for t in load_templates() if t.category == "skirt")
     found = recognise(outline, points, skirt, CONFIG)
     assert held_end_below(found, outline, points, CONFIG) is found
+    result = measure(found, outline, points, MeasurementConfig())
+    (text,) = [notice.text for notice in result.notices if notice.code == "ends_alike"]
+    assert "may be exchanged" in text

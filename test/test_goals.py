@@ -202,3 +202,13 @@ def test_stopping_answers_everybody_and_ends_the_process():
     assert all(asker.outcomes[0].cancelled for asker in askers)
     with pytest.raises(ProcessLookupError):
         os.kill(office.worker.pid, 0)
+
+
+def test_stopping_leaves_no_thread_behind():
+    """One that still spoke of the process could wake a node that is being taken down."""
+    before = set(threading.enumerate())
+    office = Office()
+    office.until(lambda: office.goals.ready)
+    assert set(threading.enumerate()) - before
+    office.goals.stop()
+    assert not set(threading.enumerate()) - before

@@ -32,7 +32,7 @@ class EndAsked:
 
     In place of rclpy's handlers, which shut the context down from a thread of their own and raise
     KeyboardInterrupt wherever the node is: of nodes that were busy a few in a hundred ended with a
-    traceback, did not end, or crashed. With a flag the callback at hand is finished, and the node
+    traceback, or not at all. With a flag the callback at hand is finished, and the node
     taken down in order; its timers wake it 20 times a second.
     """
 

@@ -146,7 +146,7 @@ def test_a_landmark_on_a_part_that_may_lie_turned_over_hangs_there_or_there():
 def test_the_corners_of_a_towel_held_by_its_middle_may_be_named_the_other_way_round():
     outline = rectangle(top_seen=True)
     points = hanging(cloth(2), (WIDTH_M / 2, LENGTH_M / 2))
-    found = held_end_below(recognise(outline, points, TOWEL, CONFIG), outline, points, CONFIG)
+    found = held_end_below(recognise(outline, points, TOWEL, CONFIG), points)
     result = measure(found, outline, points, MeasurementConfig())
     (text,) = [notice.text for notice in result.notices if notice.code == "ends_alike"]
     assert "may be exchanged" in text
@@ -188,7 +188,7 @@ def hanging(points, corner):
 )
 def test_the_end_of_a_towel_at_the_gripper_is_the_bottom_one(corner):
     outline, points = rectangle(top_seen=True), hanging(cloth(24), corner)
-    found = held_end_below(recognise(outline, points, TOWEL, CONFIG), outline, points, CONFIG)
+    found = held_end_below(recognise(outline, points, TOWEL, CONFIG), points)
     result = measure(found, outline, points, MeasurementConfig())
     marks = {mark.name: mark for mark in result.landmarks}
     away = {name: np.linalg.norm(np.array(mark.uv) - corner) for name, mark in marks.items()}
@@ -207,7 +207,32 @@ def test_the_waist_of_a_skirt_is_not_a_matter_of_the_hold(corner):
     outline, points = rectangle(top_seen=True), hanging(cloth(24), corner)
     skirt = tuple(t for t in load_templates() if t.category == "skirt")
     found = recognise(outline, points, skirt, CONFIG)
-    assert held_end_below(found, outline, points, CONFIG) is found
+    assert held_end_below(found, points) is found
     result = measure(found, outline, points, MeasurementConfig())
     (text,) = [notice.text for notice in result.notices if notice.code == "ends_alike"]
     assert "may be exchanged" in text
+
+
+def test_naming_the_ends_changes_no_size_no_place_and_no_certainty():
+    outline = rectangle(top_seen=False)
+    either = []
+    for corner in ((0.0, 0.0), (WIDTH_M, LENGTH_M)):
+        points = hanging(cloth(24), corner)
+        found = held_end_below(recognise(outline, points, TOWEL, CONFIG), points)
+        unseen = found.template_uv[~found.template_seen]
+        assert len(unseen) and np.allclose(
+            unseen[:, 1], LENGTH_M, atol=0.01
+        )  # the flat frame's top
+        either.append(measure(found, outline, points, MeasurementConfig()))
+    one, other = either
+    for a, b in zip(one.measurements, other.measurements, strict=True):
+        assert (a.name, a.inferred) == (b.name, b.inferred)
+        assert (a.value_m, a.sigma_m) == pytest.approx((b.value_m, b.sigma_m), rel=1e-9)
+    opposite = {"left_top": "right_bottom", "right_top": "left_bottom"}
+    marks = {mark.name: mark for mark in other.landmarks}
+    for mark in one.landmarks:
+        for a, b in opposite.items():
+            if mark.name in (f"{a}_corner", f"{b}_corner"):
+                twin = marks[f"{b if mark.name.startswith(a) else a}_corner"]
+                assert mark.uv == pytest.approx(twin.uv, abs=1e-9)
+                assert mark.uv_sigma_m == pytest.approx(twin.uv_sigma_m, rel=1e-6)

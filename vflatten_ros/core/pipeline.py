@@ -243,7 +243,7 @@ def _described(
         progress("recognition", 0.0)
         flattened, recognition = _recognised(flattened, tuple(templates), config, progress)
     points, outline = flattened.points, flattened.outline
-    recognition = held_end_below(recognition, outline, points, config.recognition)
+    recognition = held_end_below(recognition, points)
     progress("measurement", 0.0)
     measured = measure(recognition, outline, points, config.measurement)
     automatic = config.method == "rotation"

@@ -24,7 +24,8 @@ BLOCK = 4096  # samples placed at a time, so that they stay in the cache
 SPREAD = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # weight of distances that fall short, in turn
 # How far a near pair may fall short before it hardly counts, as a share of its distance, in turn.
 # Round the side of a tube the cloth is one sheet, and where it creases is found by the pairs that
-# give way: the fewer and the wholly, the sharper the crease (Blake and Zisserman 1987)
+# give way. The less each may, the fewer do, and wholly: the crease is sharp (graduated
+# non-convexity, Blake and Zisserman 1987)
 CREASING = (0.2, 0.1, 0.05)
 SOFTLY = CREASING[:1]  # for pieces whose edges are the creases
 CREASED = 0.2  # share of its distance by which a near pair falls short across a crease
@@ -73,7 +74,23 @@ def settle(
     spread: float = 0.0,
     creasing: Sequence[float] = CREASING[-1:],
 ) -> Float:
-    """Keep bounds and near distances, from where the points are, without spreading much more."""
+    """Keep bounds and near distances, from where the points are, without spreading much more.
+
+    Parameters
+    ----------
+    plane : ndarray of shape (k, 2)
+        Where they are, m.
+    bound, near, config
+        As of unfold.
+    spread : float
+        Weight of distances that fall short.
+    creasing : sequence of float
+        As of unfold.
+
+    Returns
+    -------
+    ndarray of shape (k, 2)
+    """
     centre, aims = plane.mean(0), _aims(bound, near)
     for slack in creasing:
         for _ in range(config.unfold_rounds):
@@ -87,6 +104,13 @@ def creased(plane: Float, bound: Float, near: Bool) -> float:
 
     A garment laid flat has few, or none where its seams are sharp. More mean that it gave way where
     distances contradict each other.
+
+    Parameters
+    ----------
+    plane : ndarray of shape (k, 2)
+        Places laid flat, m.
+    bound, near : ndarray of shape (k, k)
+        As of unfold.
     """
     apart = _pairwise(plane)[near]
     return float((apart < (1.0 - CREASED) * bound[near]).mean()) if len(apart) else 0.0

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RecognitionConfig
 from vflatten_ros.core.errors import InvalidInput
-from vflatten_ros.core.geometry import loop_normals, twice_area
+from vflatten_ros.core.geometry import distances_m, loop_normals, twice_area
 from vflatten_ros.core.templates import Float
 from vflatten_ros.core.values import Bool, FlatPoints, Int, Outline
 
@@ -130,21 +130,32 @@ def _gaps(points: FlatPoints, origin: Float, body: NDArray[np.uint8]) -> NDArray
     spacing = float(np.quantile(tree.query(uv, k=2)[0][:, 1], 0.75))
     reach_m = max(0.010, 3.0 * spacing)
     pairs = tree.query_pairs(reach_m, output_type="ndarray")
-    flat = np.linalg.norm(uv[pairs[:, 0]] - uv[pairs[:, 1]], axis=1)
-    free = np.linalg.norm(xyz[pairs[:, 0]] - xyz[pairs[:, 1]], axis=1)
-    ends = ((uv - origin) / CELL_M)[pairs[free < 1.3 * flat + 0.005]]
-    cloth = np.zeros_like(body)
-    share = np.linspace(0.0, 1.0, int(np.ceil(reach_m / CELL_M)) + 1)[:, None, None]
-    along = np.rint(ends[:, 0] + share * (ends[:, 1] - ends[:, 0])).astype(np.intp)
-    inside = ((along >= 0) & (along < body.shape[::-1])).all(axis=-1)  # strays lie beyond
-    col, row = along[inside].T
-    cloth[row, col] = 1
+    one, other = np.ascontiguousarray(pairs.T)
+    linked = distances_m(xyz, one, other) < 1.3 * distances_m(uv, one, other) + 0.005
+    steps = int(np.ceil(reach_m / CELL_M))
+    cloth = _drawn((uv - origin) / CELL_M, one[linked], other[linked], steps, body.shape)
     reach = 2 * int(np.ceil(max(0.004, 1.5 * spacing) / CELL_M)) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     bare = ((body > 0) & (cv2.dilate(cloth, disc) == 0)).astype(np.uint8)
     if bare.sum() > 0.4 * body.sum():
         return nothing
     return np.asarray(cv2.dilate(bare, disc) & body & ~cloth, dtype=np.uint8)
+
+
+def _drawn(
+    cell: Float, start: Int, end: Int, steps: int, shape: tuple[int, ...]
+) -> NDArray[np.uint8]:
+    """Image of straight lines between cells (n, 2), x first; strays lie beyond it."""
+    rows, cols = shape
+    image = np.zeros(shape, dtype=np.uint8)
+    u, v = np.ascontiguousarray(cell.T)
+    x, y = u[start], v[start]
+    dx, dy = u[end] - x, v[end] - y
+    for share in np.linspace(0.0, 1.0, steps + 1):  # one by one: the arrays stay in the cache
+        col, row = np.rint(x + share * dx), np.rint(y + share * dy)
+        inside = (col >= 0) & (col < cols) & (row >= 0) & (row < rows)
+        image.ravel()[(row * cols + col)[inside].astype(np.intp)] = 1
+    return image
 
 
 def _with_gaps(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -232,7 +233,7 @@ def _edges(placed: _Placed, config: RotationConfig) -> tuple[Notice | None, list
     if not placed.by_cameras:
         return None, []
     pitch_m = placed.grain.pitch_m
-    to_edge = [pixels_to_edge(view, pitch_m) for view in placed.views]
+    to_edge = list(mapped(partial(pixels_to_edge, pitch_m=pitch_m), placed.views))
     at_points = [near[s.index] for near, s in zip(to_edge, placed.surfaces, strict=True)]
     px = fat_px(placed.surfaces, placed.poses, at_points, config, pitch_m)
     if not px:

@@ -72,6 +72,18 @@ def tangents(normal: Float) -> tuple[Float, Float]:
     return e1, np.cross(normal, e1)
 
 
+def distances_m(points: Float, i: NDArray[np.int64], j: NDArray[np.int64]) -> Float:
+    """(m,) distances between rows i and j (m,) of (n, d) points.
+
+    Coordinate by coordinate: many times as fast as the norms of their differences.
+    """
+    squared = np.zeros(len(i))
+    for along in np.ascontiguousarray(points.T):
+        apart = along[i] - along[j]
+        squared += apart * apart
+    return np.sqrt(squared, out=squared)
+
+
 def twice_area(uv: Float) -> float:
     """Of a closed line (n, 2), positive counter-clockwise."""
     after = np.roll(uv, -1, axis=0)

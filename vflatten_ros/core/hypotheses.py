@@ -19,7 +19,7 @@ from vflatten_ros.core.tried import Tried, Verdict, best_of, rival, settled
 from vflatten_ros.core.values import Progress
 from vflatten_ros.core.ways import Said, Task, Ways
 
-FIRST_BESIDE = 2  # way that a helper begins with; before it is through, those before may settle it
+FIRST_BESIDE = 1  # way that a helper begins with, while the caller tries those before
 
 
 class Helper(Protocol):

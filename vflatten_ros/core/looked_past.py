@@ -94,10 +94,10 @@ def looked_past(
         For every `every`-th point of each surface.
     """
     margin_m = max(PAST_M, PAST_SPREADS * apart_m)
+    images = [surface.sight for surface in surfaces if surface.sight is not None]
     sights = [
-        PlacedSight(_without_holes(surface.sight), pose)
-        for surface, pose in zip(surfaces, poses, strict=True)
-        if surface.sight is not None
+        PlacedSight(sight, pose)
+        for sight, pose in zip(mapped(_without_holes, images), poses, strict=True)
     ]
 
     def of_view(k: int) -> Bool:

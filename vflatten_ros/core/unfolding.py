@@ -9,7 +9,6 @@ somewhere; and otherwise the points spread. No panels, seams or correspondences 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -56,13 +55,13 @@ def unfold(
     ndarray of shape (k, 2)
         Metres; position, rotation and mirror image are arbitrary but repeatable.
     """
-    plane, aims = _classical_scaling(bound), _aims(bound, near)
+    plane, towards = _classical_scaling(bound), _Majorisation(bound, near)
     turns = [(spread, creasing[0]) for spread in SPREAD]
     turns += [(SPREAD[-1], slack) for slack in creasing[1:]]
     rounds = [turn for turn in turns for _ in range(config.unfold_rounds)]
     for done, (spread, slack) in enumerate(rounds):
         progress("unfold", done / len(rounds))
-        plane = _majorise(plane, aims, spread, slack)
+        plane = towards.step(plane, spread, slack)
     return plane
 
 
@@ -91,10 +90,10 @@ def settle(
     -------
     ndarray of shape (k, 2)
     """
-    centre, aims = plane.mean(0), _aims(bound, near)
+    centre, towards = plane.mean(0), _Majorisation(bound, near)
     for slack in creasing:
         for _ in range(config.unfold_rounds):
-            plane = _majorise(plane, aims, spread, slack)
+            plane = towards.step(plane, spread, slack)
     settled: Float = plane + centre
     return settled
 
@@ -159,55 +158,81 @@ def _along(outline: Float, per_edge: int = 20) -> Float:
     return points.reshape(-1, 2)
 
 
-@dataclass(frozen=True, eq=False)
-class _Aims:
-    """Bounds, and what the weights of stress majorisation take from them."""
+class _Majorisation:
+    """Steps of stress majorisation (de Leeuw 1977) towards bounds.
 
-    bound: Float  # (k, k)
-    near: Bool  # (k, k)
-    base: Float  # (k, k) weight of a pair
-    stay: Float  # (k, k) of its present distance
-    safe: Float  # (k, k) the bounds, 1 where there is none
+    Its arrays of all pairs are made once: asking for such memory takes as long as filling it.
+    """
+
+    def __init__(self, bound: Float, near: Bool) -> None:
+        safe = np.where(bound > 0, bound, 1.0)  # 1 where there is no bound
+        self._bound = bound
+        self._base = (bound > 0) / safe**1.5  # weight of a pair
+        self._stay = STAY * self._base  # of its present distance
+        self._near = np.flatnonzero(near)
+        self._near_bound, self._near_safe = bound.ravel()[self._near], safe.ravel()[self._near]
+        self._near_base = self._base.ravel()[self._near]
+        self._flat, self._target, self._weight, self._system, self._short = (
+            np.empty(bound.shape) for _ in range(5)
+        )
+        self._spread = np.nan
+
+    def step(self, plane: Float, spread: float, slack: float) -> Float:
+        """Three steps under weights taken from the residuals.
+
+        Parameters
+        ----------
+        plane : ndarray of shape (k, 2)
+        spread : float
+            Weight of pairs that fall short.
+        slack : float
+            How far a near pair may fall short before it weighs as little, as a share of it.
+        """
+        k = len(plane)
+        if spread != self._spread:
+            self._spread = spread
+            np.multiply(self._base, spread, out=self._short)
+        flat = self._pairwise(plane)
+        weight, target, system = self._weight, self._target, self._system
+        np.copyto(weight, self._base)
+        np.copyto(weight, self._short, where=self._bound > flat)
+        weight.ravel()[self._near] = self._near_weight(flat, spread, slack)
+        flat *= self._stay  # a pair without any say stays where it is
+        np.multiply(weight, self._bound, out=target)
+        target += flat
+        weight += self._stay
+        np.subtract(1 / k, weight, out=system)  # 1/k: fixes the centroid
+        system.ravel()[:: k + 1] += weight.sum(1)
+        # it is symmetric; the order of its transpose is LAPACK's, which then needs no copy
+        factor = cho_factor(system.T, overwrite_a=True, check_finite=False)
+        for _ in range(3):
+            ratio = self._pairwise(plane)
+            np.maximum(ratio, 1e-9, out=ratio)
+            np.divide(target, ratio, out=ratio)
+            force = ratio.sum(1)[:, None] * plane - ratio @ plane
+            plane = cho_solve(factor, force, overwrite_b=True, check_finite=False)
+        return plane
+
+    def _near_weight(self, flat: Float, spread: float, slack: float) -> Float:
+        """Of the near pairs: the less, down to `spread`, the more they fall short."""
+        weight = np.maximum(self._near_bound - flat.ravel()[self._near], 0.0)
+        weight /= slack * self._near_safe
+        weight *= weight
+        weight += 1.0
+        np.maximum(np.divide(1.0, weight, out=weight), spread, out=weight)
+        weight *= self._near_base
+        return weight
+
+    def _pairwise(self, plane: Float) -> Float:
+        return _pairwise(plane, self._flat, self._weight)
 
 
-def _aims(bound: Float, near: Bool) -> _Aims:
-    safe = np.where(bound > 0, bound, 1.0)
-    base = (bound > 0) / safe**1.5
-    return _Aims(bound, near, base, STAY * base, safe)
-
-
-def _majorise(plane: Float, aims: _Aims, spread: float, slack: float) -> Float:
-    """Three steps of stress majorisation (de Leeuw 1977) under weights taken from the residuals."""
-    k = len(plane)
-    bound, base = aims.bound, aims.base
-    flat = _pairwise(plane)
-    short = np.maximum(bound - flat, 0.0)
-    robust = short / (slack * aims.safe)
-    robust *= robust
-    robust += 1.0
-    np.maximum(np.divide(1.0, robust, out=robust), spread, out=robust)
-    weight = np.where(short > 0, np.where(aims.near, robust, spread), 1.0)
-    weight *= base
-    flat *= aims.stay  # a pair without any say stays where it is
-    target = weight * bound
-    target += flat
-    weight += aims.stay
-    system = 1 / k - weight  # 1/k: fixes the centroid
-    system[np.diag_indices(k)] += weight.sum(1)
-    factor = cho_factor(system, overwrite_a=True, check_finite=False)
-    for _ in range(3):
-        apart = _pairwise(plane)
-        ratio = np.divide(target, np.maximum(apart, 1e-9, out=apart), out=apart)
-        force = ratio.sum(1)[:, None] * plane - ratio @ plane
-        plane = cho_solve(factor, force, overwrite_b=True, check_finite=False)
-    return plane
-
-
-def _pairwise(plane: Float) -> Float:
+def _pairwise(plane: Float, apart: Float | None = None, across: Float | None = None) -> Float:
+    """Distances, written to `apart`; `across` is overwritten."""
     x, y = plane.T
-    apart: Float = x[:, None] - x
+    apart = np.subtract(x[:, None], x, out=apart)
     apart *= apart
-    across = y[:, None] - y
+    across = np.subtract(y[:, None], y, out=across)
     across *= across
     apart += across
     return np.sqrt(apart, out=apart)

@@ -35,11 +35,11 @@ WHOLE = np.inf  # the doubt at which all links are believed
 NECK = 0.0  # stands for a cut: all links are believed but those across a narrow neck
 WAYS = (  # draw of the samples, greatest doubt of what joins pieces
     (0, WHOLE),
+    (0, NECK),  # where nothing is narrow this is soon known
     (0, 1.0),
     (0, 0.4),
-    (0, NECK),
-    (1, NECK),
     (1, WHOLE),
+    (1, NECK),
     (1, 0.4),
 )
 FINER = 0.8  # spacing of the samples drawn again, in that of the first

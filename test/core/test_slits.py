@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.distances import pieces
 from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.outline import outline_of
 from vflatten_ros.core.sheets import Links
-from vflatten_ros.core.slits import AWAY, slits
+from vflatten_ros.core.slits import AWAY, slits, stretches
 
 CONFIG = RotationConfig()
 STEP_M, SIDE_M, AT_M = CONFIG.spacing_m, 0.2, 0.101
@@ -48,6 +49,31 @@ def layers(*each):
     length = np.linalg.norm(uv[a] - uv[b], axis=1)
     links = Links(a, b, length, np.zeros(len(a), dtype=bool), np.zeros(len(a)))
     return uv, side, edge, links
+
+
+@pytest.mark.parametrize("spread_m", [0.0, 0.002, 0.02])
+def test_stretches_are_what_all_pairs_within_reach_join(spread_m):
+    """Thousands of points in a few clumps, chains between them, and some alone."""
+    rng = np.random.default_rng(3)
+    clumps = np.repeat(rng.uniform(-0.1, 0.1, (40, 2)), 60, axis=0)
+    chain = np.column_stack([np.arange(0.2, 0.3, 0.0099), np.zeros(11)])  # just near enough
+    apart = np.column_stack([np.arange(0.2, 0.3, 0.0101), np.ones(10)])  # just not
+    clumps = clumps + rng.normal(0, spread_m, clumps.shape)
+    sparse = np.vstack([rng.uniform([0, k], [0.2, k + 0.2], (50 * k, 2)) for k in (2, 4, 8)])
+    inner = [[0.95, 0], [0.94, 0.5], [0.1, 0.9], [2.06, 0.99], [2.07, 0.5], [2.9, 0.1]]  # its
+    # second joins the three before the gap with those after it, and is no outermost one
+    points = np.vstack([clumps, chain, apart, sparse, [-0.7, -0.7] + 0.007 * np.array(inner)])
+    points = points[rng.permutation(len(points))]
+    i, j = cKDTree(points).query_pairs(0.01, output_type="ndarray").T
+    found = stretches(points, 0.01)
+    assert found.tolist() == pieces(i, j, np.ones(len(points), dtype=bool)).tolist()
+    at = {tuple(p): label for p, label in zip(points.round(9), found, strict=True)}
+    assert len({at[tuple(p)] for p in chain.round(9)}) == 1
+    assert len({at[tuple(p)] for p in apart.round(9)}) == len(apart)
+
+
+def test_nothing_has_no_stretches():
+    assert stretches(np.zeros((0, 2)), 0.01).shape == (0,)
 
 
 def test_a_slit_is_found_along_its_whole_length_and_nowhere_else():

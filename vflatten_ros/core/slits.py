@@ -52,7 +52,7 @@ def slits(uv: Float, side: Float, edge: Int, links: Links, config: RotationConfi
     ends, laid = _laid(uv, side, edge, links, config)
     i, j = _torn(laid, ends, BESIDE * laid.spacing_m)
     middle = (uv[i] + uv[j]) / 2
-    label = _stretches(middle, laid)
+    label = stretches(middle, BESIDE * laid.spacing_m)
     long = np.bincount(label) * laid.spacing_m > SEED_M  # fewer points than that cannot be
     found = []
     for k in np.flatnonzero(long):
@@ -84,6 +84,45 @@ def torn(
     """
     ends, laid = _laid(uv, side, edge, links, config)
     return _torn(laid, ends, BESIDE * laid.spacing_m)
+
+
+def stretches(points: Float, reach_m: float) -> Int:
+    """Which points hang together over steps of at most some length.
+
+    There may be millions of pairs so near, and most are not looked at: all points in a square of
+    that diagonal are near each other, its outermost ones join it to the next squares, and all pairs
+    are looked at only of what is then not in the largest stretch.
+
+    Parameters
+    ----------
+    points : ndarray of shape (m, 2)
+    reach_m : float
+
+    Returns
+    -------
+    ndarray of shape (m,)
+        Number of the stretch that each belongs to.
+    """
+    if not len(points):
+        return np.zeros(0, dtype=np.int64)
+    everywhere = np.ones(len(points), dtype=bool)
+    square = np.floor(points / (0.7 * reach_m)).astype(np.int64)
+    square -= square.min(axis=0)
+    number = square[:, 0] * (square[:, 1].max() + 1) + square[:, 1]
+    ordered = [np.lexsort((along, number)) for along in points.T]
+    by_u = ordered[0]
+    alike = number[by_u[1:]] == number[by_u[:-1]]
+    first, last = np.r_[True, ~alike], np.r_[~alike, True]
+    outermost = np.unique(np.concatenate([order[first | last] for order in ordered]))
+    i, j = cKDTree(points[outermost]).query_pairs(reach_m, output_type="ndarray").T
+    one = np.r_[by_u[:-1][alike], outermost[i]]
+    other = np.r_[by_u[1:][alike], outermost[j]]
+    joined = pieces(one, other, everywhere)
+    rest = np.flatnonzero(joined != np.bincount(joined).argmax())
+    pairs = cKDTree(points[rest]).sparse_distance_matrix(
+        cKDTree(points), reach_m, output_type="coo_matrix"
+    )
+    return pieces(np.r_[one, rest[pairs.row]], np.r_[other, pairs.col], everywhere)
 
 
 def _straight(line: Float) -> tuple[Float, Float, float]:
@@ -135,7 +174,7 @@ def _widened(laid: _Laid, line: Float, centre: Float, across: Float, ends: Int) 
     i, j = _torn(laid, straight, wide_m)
     middle = (uv[i] + uv[j]) / 2
     middle = middle[np.abs((middle - centre) @ across) < AWAY / 2 * laid.spacing_m]
-    stretch = _stretches(middle, laid)
+    stretch = stretches(middle, BESIDE * laid.spacing_m)
     wide: Float = middle[np.isin(stretch, stretch[cKDTree(middle).query(line)[1]])]
     return wide
 
@@ -151,12 +190,6 @@ def _torn(laid: _Laid, ends: Int, most_m: float) -> tuple[Int, Int]:
         far = ~_joined_within(way, i, j, laid.linked)
         i, j = i[far], j[far]
     return i, j
-
-
-def _stretches(points: Float, laid: _Laid) -> Int:
-    """Number of the stretch that each of (m, 2) points belongs to."""
-    i, j = cKDTree(points).query_pairs(BESIDE * laid.spacing_m, output_type="ndarray").T
-    return pieces(i, j, np.ones(len(points), dtype=bool))
 
 
 def _linked(links: Links, count: int) -> csr_matrix:

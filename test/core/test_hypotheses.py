@@ -261,9 +261,9 @@ def test_an_outline_that_lies_deep_inside_its_category_is_odd():
 
 
 def test_a_bad_way_and_a_near_tie_of_categories_are_not_to_be_trusted():
-    assert not tried().untrusted and not tried(sure=0.75).untrusted
+    assert not tried().untrusted and not tried(sure=0.92).untrusted
     assert "does not lie flat" in tried(overlap=0.2).untrusted
-    assert "60% likely" in tried(sure=0.6, misfit=-0.9).untrusted
+    assert "85% likely" in tried(sure=0.85, misfit=-0.9).untrusted
     near, farther = tried(misfit=-0.4, category="skirt"), tried(misfit=-0.2, category="skirt")
     assert rival([tried(), near]) == "skirt"
     assert rival([tried(), farther, tried(misfit=-0.4, category="unknown")]) == ""

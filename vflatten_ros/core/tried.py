@@ -30,7 +30,7 @@ NEAR_TIE = 0.67  # share of the best category's votes, for the result not to be 
 SURE = 0.97  # probability of a category below which one way alone is not believed
 MOST_UNSEEN = 0.15  # share of the outline that no view shows, above which it is not, either
 DOUBTFUL = 0.3  # badness above which a result is not to be trusted, and more ways are tried
-UNSURE = 0.7  # probability of its category below which it is not, either
+UNSURE = 0.9  # probability of its category below which it is not, either
 OF_STRIP = 0.35  # of the width of the strip that what is hidden would make across the item
 IN_FOLD_M = 0.03  # how much cloth a fold between two parts of a single sheet hides, one deviation:
 # 4 to 5 cm in four towels. Nothing else tells how far apart they lie

@@ -1,7 +1,7 @@
 """The ends of a sheet that looks the same turned by half a turn: names that do not hang on chance.
 
 Nothing tells the two ends of a towel apart but how it hangs. By convention the end at the gripper
-is the one called bottom, as in simulated recordings: what hangs lowest is at the top.
+is the one called bottom, as in most simulated recordings: what hangs lowest is at the top.
 """
 
 from __future__ import annotations

@@ -186,7 +186,7 @@ class _Majorisation:
         spread : float
             Weight of pairs that fall short.
         slack : float
-            How far a near pair may fall short before it weighs as little, as a share of it.
+            How far a near pair falls short where it weighs half, as a share of its distance.
         """
         k = len(plane)
         if spread != self._spread:

@@ -48,6 +48,7 @@ def tried(
     torn_m=0.0,
     cloth=0.9,
     creased=0.0,
+    size_m=(0.4, 0.4),
 ):
     """A towel of 0.4 x 0.4 m, or what is said of it; its upper edge may lie further in.
 
@@ -83,7 +84,10 @@ def tried(
                 vertices=4,
                 single_sheet=doubled is not None,
                 seam=np.array([False, True, False, True]) & (doubled is None),
+                measure=lambda *_: {"width": (size_m[0], 0.01), "length": (size_m[1], 0.01)},
             ),
+            state=np.zeros(2),
+            covariance=np.eye(5),
             points=lambda: square,
         ),
     )
@@ -228,6 +232,28 @@ def test_two_ways_outvote_one_that_disagrees():
     assert not settled([tried(misfit=0.0), like, like, other, other])
     assert not settled([good, tried(misfit=1.5), other])  # too bad a way to count
     assert not settled([tried(misfit=-0.3, sure=0.85), like, other])
+
+
+def test_if_no_way_is_to_be_trusted_the_one_whose_sizes_others_agree_with_is_best():
+    """A wrong way is wrong in its own manner; one that lies well needs no others."""
+    short = tried(misfit=0.6, size_m=(0.4, 0.26))
+    right = [tried(misfit=1.0, size_m=(0.4, 0.4)), tried(misfit=1.1, size_m=(0.41, 0.4))]
+
+    def best(*ways):
+        return judging.best_of([one.verdict for one in ways]).size_m
+
+    assert best(short, *right) == (0.4, 0.4)
+    assert best(short, right[0]) == (0.4, 0.26)  # nobody agrees with either
+    assert best(short, right[0], tried(misfit=1.1, size_m=(0.5, 0.4))) == (0.4, 0.26)
+    assert best(short, tried(misfit=2.0), tried(misfit=2.0)) == (0.4, 0.26)  # far worse
+    assert best(short, right[0], tried(misfit=1.0, category="skirt")) == (0.4, 0.26)
+    trusted = tried(misfit=0.1, size_m=(0.4, 0.26))
+    assert best(trusted, *right, *right) == (0.4, 0.26)
+    unlike = tried(misfit=1.0, category="unknown")  # sizes of nothing in particular
+    assert best(tried(misfit=0.6, category="unknown", size_m=(0.4, 0.26)), unlike, unlike) == (
+        0.4,
+        0.26,
+    )
 
 
 def test_the_best_way_is_of_the_category_that_most_speaks_for(method, monkeypatch):

@@ -25,6 +25,7 @@ YIELDING = 0.15  # by which the third way and each further one raise these two
 RIVAL = 1.5  # how much worse ways to other categories may be
 MAJORITY = 2  # ways of the best one's category for each such, for them not to count
 UNDECIDED = 0.9  # probability of the best way's category below which it is unsure
+AGREE = 0.03  # share by which sizes of ways that agree differ
 VOTE = 2.0  # by how many e-folds a way counts less if it is worse by 1
 NEAR_TIE = 0.67  # share of the best category's votes, for the result not to be trusted
 SURE = 0.97  # probability of a category below which one way alone is not believed
@@ -72,6 +73,7 @@ class Verdict:
     sure: float  # probability of the likeliest category
     parts: int  # groups that only the category joins, or 1
     unseen: float  # share of the outline that no view shows
+    size_m: tuple[float, float] = (0.0, 0.0)  # width and length; 0: none
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +199,15 @@ class Tried:
         return max(known, default=0.0)
 
     @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and length, m; 0 without an outline."""
+        fit = self.found.fit
+        if fit is None:
+            return 0.0, 0.0
+        found = fit.template.measure(fit.state, fit.covariance[3:, 3:])
+        return found["width"][0], found["length"][0]
+
+    @property
     def verdict(self) -> Verdict:
         """All that is needed of it beside other ways."""
         return Verdict(
@@ -205,6 +216,7 @@ class Tried:
             sure=self.sure,
             parts=len(self.unfolded.parts),
             unseen=self.unseen,
+            size_m=self.size_m,
         )
 
     @property
@@ -263,7 +275,27 @@ def _votes(tries: Sequence[Verdict]) -> dict[str, float]:
 
 
 def best_of(tries: Sequence[Verdict]) -> Verdict:
-    """The best way, to the category with most votes."""
+    """The best way, to the category with most votes.
+
+    If none is to be trusted, the one that others of the category agree with in size: a wrong way
+    is wrong in its own manner, and what lies badly may still have the right size.
+    """
     votes = _votes(tries)
     category = max(votes, key=lambda name: votes[name])
-    return min((t for t in tries if t.category == category), key=lambda t: t.badness)
+    alike = [one for one in tries if one.category == category]
+    best = min(alike, key=lambda one: one.badness)
+    if best.badness <= DOUBTFUL or category == UNKNOWN:
+        return best
+    return max(alike, key=lambda one: _agreeing(one, alike))
+
+
+def _agreeing(one: Verdict, alike: Sequence[Verdict]) -> float:
+    """How much speaks for a way's sizes: its own vote, and of others as far as theirs are alike."""
+    if 0.0 in one.size_m:
+        return 0.0
+    least = min(each.badness for each in alike)
+    said = [each for each in alike if 0.0 not in each.size_m]
+    ratio = np.array([each.size_m for each in said]) / one.size_m
+    off = ((np.log(ratio) / AGREE) ** 2).sum(axis=1)
+    vote = np.exp(least - np.array([each.badness for each in said]))
+    return float(vote @ np.exp(-0.5 * off))

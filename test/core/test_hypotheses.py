@@ -327,6 +327,7 @@ def method(monkeypatch):
     monkeypatch.setattr(ways, "group_pieces", lambda surface, *_: surface)
     monkeypatch.setattr(ways, "cut_at_neck", lambda surface, *_: surface)
     monkeypatch.setattr(ways, "_recognised", recognised)
+    monkeypatch.setattr(ways, "hem_within", lambda *_: None)
     monkeypatch.setattr(ways._Draw, "_from_groups", lambda _, one, progress: recognised(one))
     return noted
 
@@ -548,7 +549,7 @@ def test_groups_that_lie_like_a_skirt_and_are_legs_are_none(monkeypatch, legs):
         )
         return replace(one, found=found)
 
-    monkeypatch.setattr(ways, "link_surface", lambda *_: None)
+    monkeypatch.setattr(ways, "link_surface", lambda *_: SimpleNamespace(even=0.0))
     group = SimpleNamespace(points=None, side=None, outline=None)
     monkeypatch.setattr(ways, "unfold_group", lambda *_: group)
     monkeypatch.setattr(ways, "Group", lambda *_: None)

@@ -256,7 +256,7 @@ def parted(
         probability that there is one.
     """
     surface, row, points, side = unfolded.surface, unfolded.row, unfolded.points, unfolded.side
-    edge, links = _as_laid(surface, row, points.uv)
+    edge, links = as_laid(surface, row, points.uv)
     slit = middle_slit(points.uv, side, edge, links, axes, config)
     if slit is None:
         return None
@@ -396,7 +396,7 @@ def _outline(
     item: Float | None = None,
 ) -> Outline:
     """Outline of the samples `row`, which lie where the points are."""
-    edge, links = _as_laid(surface, row, points.uv)
+    edge, links = as_laid(surface, row, points.uv)
     cuts = slits(points.uv, side, edge, links, config)
     slit = None
     if surface.banks is not None:
@@ -404,8 +404,8 @@ def _outline(
     return outline_of(points.uv[firm], points.sigma_m[firm], edge[firm], config, cuts, item, slit)
 
 
-def _as_laid(surface: Surface, row: Int, uv: Float) -> tuple[Int, Links]:
-    """Edges of the samples `row`, which lie at `uv`, and the links between them."""
+def as_laid(surface: Surface, row: Int, uv: Float) -> tuple[Int, Links]:
+    """Edges of the samples `row` as they lie at `uv` (see edges_laid), and links between them."""
     laid = np.zeros(len(surface.edge), dtype=bool)
     laid[row] = True
     order = np.argsort(row)

@@ -15,10 +15,16 @@ from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.fused import Fused, drawn_again
 from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold_group
+from vflatten_ros.core.hems import cut_at_hem, hem_within
 from vflatten_ros.core.middle_slit import axes_of
 from vflatten_ros.core.necks import cut_at_neck
 from vflatten_ros.core.placing import Group, place_groups, turned_over
-from vflatten_ros.core.recognition import UNKNOWN, Recognition, likeliest_of, recognise
+from vflatten_ros.core.recognition import (
+    UNKNOWN,
+    Recognition,
+    likeliest_of,
+    recognise,
+)
 from vflatten_ros.core.rotation import (
     Surface,
     Unfolded,
@@ -125,12 +131,26 @@ class _Draw:
         self._doubted: Surface | None = None
 
     def tried(self, doubt: float, progress: Progress) -> Tried:
-        """One of WAYS.
+        """One of WAYS; if a hem lies within, cut along it, or as it was, whichever is better.
 
         Raises
         ------
         DisconnectedSurface
         """
+        tried, config = self._laid(doubt, progress), self._config
+        fit = tried.found.fit
+        if fit is None or fit.misfit > HOPELESS:
+            return tried
+        hem = hem_within(tried.unfolded, fit, config.rotation)
+        if hem is None:
+            return tried
+        grouped = cut_at_hem(tried.unfolded, hem, config.rotation, progress)
+        if grouped is None:
+            return tried
+        cut = self._from_groups(grouped, progress)
+        return min((tried, cut), key=lambda one: one.badness)
+
+    def _laid(self, doubt: float, progress: Progress) -> Tried:
         config = self._config
         if doubt == WHOLE:
             unfolded = unfold_surface(self._linked, config.rotation, progress)

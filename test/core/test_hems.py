@@ -1,0 +1,133 @@
+"""A hem amid the flat surface, where other cloth lies flush against it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vflatten_ros.core import ways
+from vflatten_ros.core.config import Config, RotationConfig
+from vflatten_ros.core.distances import link_steps
+from vflatten_ros.core.grouping import unfold_group
+from vflatten_ros.core.hems import Hem, cut_at_hem, hem_within
+from vflatten_ros.core.rotation import Surface, unfold_surface
+from vflatten_ros.core.sheets import link_samples, sheet_edges
+
+CONFIG = RotationConfig(landmarks=150)
+WIDTH_M, LENGTH_M, APART_M = 0.3, 0.36, 0.006
+FLAP = (0.08, 0.2, 0.1)  # from and to along the hem, and beyond it
+
+
+def sheet(width_m, low_m, high_m, seed, left_m=0.0):
+    step = CONFIG.spacing_m
+    u = np.arange(left_m + step / 2, left_m + width_m, step)
+    v = np.arange(low_m + step / 2, high_m, step)
+    at = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+    return at + np.random.default_rng(seed).normal(0.0, 0.1 * step, at.shape)
+
+
+def tube(flap=None):
+    """Front and back of a flattened tube, hem down; a flap lies flush against the front's hem."""
+    front, back = sheet(WIDTH_M, 0.0, LENGTH_M, 1), sheet(WIDTH_M, 0.0, LENGTH_M, 2)
+    if flap is not None:
+        start, end, beyond = flap
+        front = np.vstack([front, sheet(end - start, -beyond, 0.0, 3, start)])
+    above, below = (np.full(len(p), s * APART_M / 2) for p, s in ((front, 1), (back, -1)))
+    xyz = np.vstack([np.column_stack([front, above]), np.column_stack([back, below])])
+    normal = np.zeros_like(xyz)
+    normal[:, 2] = np.sign(xyz[:, 2])
+    links = link_samples(xyz, normal, CONFIG)
+    flat = ~links.rim
+    edge = sheet_edges(xyz, normal, links.a[flat], links.b[flat], CONFIG)
+    none = np.zeros(len(xyz), dtype=np.int64)
+    samples = SimpleNamespace(xyz=xyz, normal=normal)
+    steps = link_steps(xyz, normal, links)
+    return Surface(samples, links, steps, edge, none.astype(float), none, np.zeros((len(xyz), 2)))
+
+
+def laid_like(surface):
+    """Laid flat; the plane turned and shifted so that the front lies as it was made."""
+    unfolded = unfold_surface(surface, CONFIG)
+    front = surface.samples.xyz[unfolded.row, 2] > 0
+    lies, made = unfolded.points.uv[front], surface.samples.xyz[unfolded.row, :2][front]
+    mean = lies.mean(axis=0), made.mean(axis=0)
+    one, _, other = np.linalg.svd((lies - mean[0]).T @ (made - mean[1]))
+    unfolded.points.uv[:] = (unfolded.points.uv - mean[0]) @ one @ other + mean[1]
+    unfolded.side[:] = np.where(front, 1.0, -1.0)
+    return unfolded
+
+
+def fitted(low_m, seam=(False, True, False, True)):
+    """A rectangle from some way below the hem to the waist, with seams at its sides."""
+    corners = [[0.0, low_m], [WIDTH_M, low_m], [WIDTH_M, LENGTH_M], [0.0, LENGTH_M]]
+    corners.insert(1, [0.4 * WIDTH_M, low_m])  # on the hem
+    template = SimpleNamespace(vertices=5, seam=np.array([seam[0], *seam]))
+    return SimpleNamespace(points=lambda: np.array(corners), template=template, misfit=-0.5)
+
+
+@pytest.fixture(scope="module")
+def flush():
+    return laid_like(tube(FLAP))
+
+
+def test_a_hem_against_which_other_cloth_lies_flush_is_found(flush):
+    assert np.ptp(flush.points.uv[:, 1]) > LENGTH_M + 0.9 * FLAP[2]  # laid end to end
+    hem = hem_within(flush, fitted(-FLAP[2]), CONFIG)
+    assert hem.depth_m == pytest.approx(FLAP[2], abs=CONFIG.spacing_m)
+    assert hem.inward == pytest.approx([0.0, 1.0])
+    assert hem.start[1] == -FLAP[2]
+
+
+def test_where_the_category_has_seams_none_is_looked_for(flush):
+    assert hem_within(flush, fitted(-FLAP[2], seam=(True, True, False, True)), CONFIG) is None
+
+
+def test_the_hem_of_the_item_itself_is_not_within():
+    plain = laid_like(tube())
+    assert hem_within(plain, fitted(0.0), CONFIG) is None
+    assert hem_within(plain, fitted(0.01), CONFIG) is None
+    assert hem_within(plain, fitted(-0.01), CONFIG) is None
+
+
+def test_cut_along_it_the_item_is_as_long_as_it_is(flush):
+    grouped = cut_at_hem(flush, hem_within(flush, fitted(-FLAP[2]), CONFIG), CONFIG)
+    flap = flush.surface.samples.xyz[:, 1] < 0.0
+    assert len(grouped.masks) == 2
+    main, other = grouped.masks
+    assert (main == ~flap).mean() > 0.99 and (other == flap).mean() > 0.99
+    laid = unfold_group(grouped, 0, CONFIG)
+    size = np.sort(np.ptp(laid.points.uv, axis=0))
+    assert size == pytest.approx([WIDTH_M, LENGTH_M], abs=2 * CONFIG.spacing_m)
+
+
+def test_a_hem_that_nothing_leads_across_needs_no_cut(flush):
+    below = Hem(np.array([0.0, -0.2]), np.array([0.0, 1.0]), 0.05, 9.0)
+    assert cut_at_hem(flush, below, CONFIG) is None
+
+
+def test_a_way_is_cut_at_a_hem_if_it_is_better_so(monkeypatch):
+    def way(badness, misfit=0.0):
+        return SimpleNamespace(
+            badness=badness,
+            unfolded=None,
+            found=SimpleNamespace(fit=SimpleNamespace(misfit=misfit)),
+        )
+
+    def tried(laid, cut, hem="hem", grouped="grouped"):
+        monkeypatch.setattr(ways._Draw, "_laid", lambda *_: laid)
+        monkeypatch.setattr(ways._Draw, "_from_groups", lambda *_: cut)
+        monkeypatch.setattr(ways, "hem_within", lambda *_: hem)
+        monkeypatch.setattr(ways, "cut_at_hem", lambda *_: grouped)
+        draw = ways._Draw.__new__(ways._Draw)
+        draw._config = Config()
+        return draw.tried(ways.WHOLE, lambda *_: None)
+
+    laid, better, worse = way(0.5), way(0.2), way(0.6)
+    assert tried(laid, better) is better and tried(laid, worse) is laid
+    assert tried(laid, better, hem=None) is laid and tried(laid, better, grouped=None) is laid
+    wrong = way(3.0, misfit=1.0)  # its category says nothing of where hems may be
+    assert tried(wrong, better) is wrong
+    wrong.found.fit = None
+    assert tried(wrong, better) is wrong

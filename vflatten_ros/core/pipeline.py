@@ -169,7 +169,8 @@ def _rotation(
     about_axis = [replace(view, calibration=calibration) for view in views]
     del fused  # its points are many
     unfolded, found = best.unfolded, best.found
-    turn, turns = 0, TURNS if found.category != UNKNOWN else 0
+    # one cloth has no loose parts, and no slit that may come out
+    turn, turns = 0, 0 if found.category == UNKNOWN or found.one_cloth else TURNS
     while turn < turns:
         progress("parts", turn / turns)
         fit = found.fits[found.category]

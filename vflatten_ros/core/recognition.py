@@ -11,6 +11,7 @@ from vflatten_ros.core.config import RecognitionConfig
 from vflatten_ros.core.doubled import MISLAID, doubled_share
 from vflatten_ros.core.errors import InvalidInput
 from vflatten_ros.core.evidence import Evidence, evidence_from, look_up
+from vflatten_ros.core.faces import ONE_CLOTH
 from vflatten_ros.core.model_images import model_image_scores
 from vflatten_ros.core.template_fit import (
     ALONG,
@@ -32,6 +33,9 @@ FREEDOM = 25.0  # of an ordinary category: what its pose and sizes cost in evide
 AS_CUT = 0.2  # of the swing of parts, where nothing turned them
 UNEXPLAINED = 1.5  # what an observation that only others explain costs a category (log odds)
 DOUBLED = 60.0  # what a doubled share above MISLAID costs a single sheet (log odds)
+OF_ONE_CLOTH = (
+    75.0  # what faces that are more evenly apart than ONE_CLOTH cost a garment (log odds)
+)
 WORTH_WEIGHING = 1e-4  # probability of a category before loose parts were turned
 HOPELESS = 40.0  # a category with this much more energy than the best is not refined with care
 COARSE = (((12.0, 9.0), 16), ((6.0, 6.0), BEST))  # cuts of the steps, in sigmas; hypotheses kept
@@ -50,6 +54,13 @@ class Recognition:
     template_uv: Float  # (k, 2) the category's outline, flat frame; (0, 2) if unknown
     template_seen: Bool  # (k,) whether a view shows the outline near the vertex
     fits: Mapping[str, Fit]  # category -> its best fit
+    even: float = 0.0  # 0-1, see evenly_apart
+
+    @property
+    def one_cloth(self) -> bool:
+        """Whether it is a single sheet that its two faces show to be one, too."""
+        single = self.fit is not None and self.fit.template.single_sheet
+        return self.category != UNKNOWN and single and self.even >= ONE_CLOTH
 
 
 def recognise(
@@ -59,6 +70,7 @@ def recognise(
     config: RecognitionConfig,
     progress: Progress = no_progress,
     begin: Mapping[str, tuple[Float, Float]] | None = None,
+    even: float = 0.0,
 ) -> Recognition:
     """Compare a flattened item with every category.
 
@@ -75,6 +87,8 @@ def recognise(
     progress : Progress
     begin : mapping of str to (ndarray of shape (3,), ndarray of shape (m,)), optional
         By category, the pose and state that it is fitted from, in place of all rotations.
+    even : float
+        How much of it has its two faces as far apart as most, see evenly_apart.
 
     Returns
     -------
@@ -91,9 +105,9 @@ def recognise(
     evidence = evidence_from(outline, points, config)
     scores = model_image_scores(evidence.outline, templates, config.decay, config.model_rotations)
     fits = fit_templates(templates, evidence, config, progress, begin)
-    probabilities = _probabilities(fits, evidence, points, config)
+    probabilities = _probabilities(fits, evidence, points, config, even)
     none = np.zeros((0, 2))
-    of_none = Recognition("", scores, {}, None, none, np.zeros(0, dtype=bool), fits)
+    of_none = Recognition("", scores, {}, None, none, np.zeros(0, dtype=bool), fits, even)
     return likeliest_of(of_none, probabilities)
 
 
@@ -133,14 +147,14 @@ def recognise_again(
     """
     before = found.fits[found.category]
     if not before.template.parts:
-        anew = recognise(outline, points, templates, config)
+        anew = recognise(outline, points, templates, config, even=found.even)
         if anew.category != UNKNOWN:
             return anew
     evidence = evidence_from(outline, points, config)
     alike = [t for t in templates if t.same_build(before.template)]
     alike = [t for t in alike if found.probabilities.get(t.category, 0.0) > WORTH_WEIGHING]
     fits = {t.category: _fitted_from(before, t, evidence) for t in alike or [before.template]}
-    weighed = _probabilities(fits, evidence, points, config)
+    weighed = _probabilities(fits, evidence, points, config, found.even)
     del weighed[UNKNOWN]
     together = sum(found.probabilities.get(name, 0.0) for name in fits) / sum(weighed.values())
     category = max(weighed, key=lambda name: weighed[name])
@@ -293,8 +307,17 @@ def _edge_distances(evidence: Evidence, outline: Float) -> tuple[Float, Float]:
     return distance, seen * faces
 
 
+def of_one_cloth(template: Template, even: float) -> float:
+    """What it costs a garment with a front and a back that the item seems one cloth (log odds)."""
+    return 0.0 if template.single_sheet else OF_ONE_CLOTH * max(0.0, even - ONE_CLOTH)
+
+
 def _probabilities(
-    fits: Mapping[str, Fit], evidence: Evidence, points: FlatPoints, config: RecognitionConfig
+    fits: Mapping[str, Fit],
+    evidence: Evidence,
+    points: FlatPoints,
+    config: RecognitionConfig,
+    even: float,
 ) -> dict[str, float]:
     names = [*fits, UNKNOWN]
     doubled = 0.0
@@ -308,6 +331,7 @@ def _probabilities(
         fit.evidence
         - UNEXPLAINED * observations * (most - fit.explained)
         - doubled * fit.template.single_sheet
+        - of_one_cloth(fit.template, even)
         for fit in fits.values()
     ]
     logs.append(-FREEDOM - config.unknown_misfit * observations)

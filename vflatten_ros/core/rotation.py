@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.distances import Distances, Steps, link_steps, surface_distances
+from vflatten_ros.core.faces import evenly_apart
 from vflatten_ros.core.fused import Fused
 from vflatten_ros.core.fusion import Samples
 from vflatten_ros.core.middle_slit import Axis, Banks, banks_of, between, middle_slit
@@ -65,6 +66,7 @@ class Surface:
     view_id: Int  # (n,) of the measured point nearest to each sample
     pixel: Int  # (n, 2)
     banks: Banks | None = None  # of a slit that leads up the middle
+    even: float = 0.0  # 0-1, see evenly_apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +280,8 @@ def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_p
     edge = _edges(samples, links, fused.sights, config)
     doubt = np.zeros(len(samples.xyz))
     steps = link_steps(samples.xyz, samples.normal, links)
-    return Surface(samples, links, steps, edge, doubt, fused.view_id, fused.pixel)
+    even = evenly_apart(samples.xyz, samples.normal, config)
+    return Surface(samples, links, steps, edge, doubt, fused.view_id, fused.pixel, even=even)
 
 
 def _told(fused: Fused, config: RotationConfig) -> tuple[Int, Int]:

@@ -23,6 +23,7 @@ from vflatten_ros.core.recognition import (
     UNKNOWN,
     Recognition,
     likeliest_of,
+    of_one_cloth,
     recognise,
 )
 from vflatten_ros.core.rotation import (
@@ -177,7 +178,11 @@ class _Draw:
         groups = [Group(one.points, one.side, one.outline) for one in laid]
         placings = place_groups(groups, self._templates, config, progress)
         least = placings[0].cost
-        odds = {p.template.category: float(np.exp(least - p.cost)) for p in placings}
+        even = self._linked.even
+        odds = {
+            p.template.category: float(np.exp(least - p.cost - of_one_cloth(p.template, even)))
+            for p in placings
+        }
         placed = []
         for placing in placings[:PLACED_WAYS]:
             if odds[placing.template.category] < LEAST_ODDS:
@@ -243,10 +248,12 @@ def _recognised(
 ) -> Tried:
     def named(laid: Unfolded) -> Recognition:
         outline, points = laid.outline, laid.points
-        return recognise(outline, points, templates, config.recognition, progress, begin)
+        settings, even = config.recognition, laid.surface.even
+        return recognise(outline, points, templates, settings, progress, begin, even)
 
     found = named(unfolded)
-    if begin is None and (fit := found.fit) is not None and not fit.template.parts:
+    fit = found.fit
+    if begin is None and fit is not None and not fit.template.parts and not found.one_cloth:
         outline = fit.points()[: fit.template.vertices]
         axes = axes_of(outline, fit.pose, across=fit.template.single_sheet)
         cut = parted(unfolded, axes, config.rotation)  # are these legs?

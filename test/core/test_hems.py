@@ -91,8 +91,9 @@ def test_the_hem_of_the_item_itself_is_not_within():
     assert hem_within(plain, fitted(-0.01), CONFIG) is None
 
 
-def test_cut_along_it_the_item_is_as_long_as_it_is(flush):
-    grouped = cut_at_hem(flush, hem_within(flush, fitted(-FLAP[2]), CONFIG), CONFIG)
+@pytest.mark.parametrize("anew", [False, True])
+def test_cut_along_it_the_item_is_as_long_as_it_is(flush, anew):
+    grouped = cut_at_hem(flush, hem_within(flush, fitted(-FLAP[2]), CONFIG), anew, CONFIG)
     flap = flush.surface.samples.xyz[:, 1] < 0.0
     assert len(grouped.masks) == 2
     main, other = grouped.masks
@@ -104,30 +105,48 @@ def test_cut_along_it_the_item_is_as_long_as_it_is(flush):
 
 def test_a_hem_that_nothing_leads_across_needs_no_cut(flush):
     below = Hem(np.array([0.0, -0.2]), np.array([0.0, 1.0]), 0.05, 9.0)
-    assert cut_at_hem(flush, below, CONFIG) is None
+    assert cut_at_hem(flush, below, False, CONFIG) is None
 
 
-def test_a_way_is_cut_at_a_hem_if_it_is_better_so(monkeypatch):
-    def way(badness, misfit=0.0):
-        return SimpleNamespace(
-            badness=badness,
-            unfolded=None,
-            found=SimpleNamespace(fit=SimpleNamespace(misfit=misfit)),
-        )
+def way(badness, misfit=0.0, fitted=True):
+    fit = SimpleNamespace(misfit=misfit) if fitted else None
+    return SimpleNamespace(
+        badness=badness,
+        untrusted="" if badness < 0.3 else "so bad",
+        unfolded=None,
+        found=SimpleNamespace(fit=fit),
+    )
 
-    def tried(laid, cut, hem="hem", grouped="grouped"):
+
+@pytest.fixture
+def tried(monkeypatch):
+    """What comes of a way, of the item cut and of it cut and laid flat anew."""
+
+    def of(laid, *cut, hem="hem", grouped="grouped"):
+        left = iter(cut)
         monkeypatch.setattr(ways._Draw, "_laid", lambda *_: laid)
-        monkeypatch.setattr(ways._Draw, "_from_groups", lambda *_: cut)
+        monkeypatch.setattr(ways._Draw, "_from_groups", lambda *_: next(left))
         monkeypatch.setattr(ways, "hem_within", lambda *_: hem)
         monkeypatch.setattr(ways, "cut_at_hem", lambda *_: grouped)
         draw = ways._Draw.__new__(ways._Draw)
         draw._config = Config()
         return draw.tried(ways.WHOLE, lambda *_: None)
 
-    laid, better, worse = way(0.5), way(0.2), way(0.6)
-    assert tried(laid, better) is better and tried(laid, worse) is laid
-    assert tried(laid, better, hem=None) is laid and tried(laid, better, grouped=None) is laid
-    wrong = way(3.0, misfit=1.0)  # its category says nothing of where hems may be
-    assert tried(wrong, better) is wrong
-    wrong.found.fit = None
-    assert tried(wrong, better) is wrong
+    return of
+
+
+def test_a_way_is_cut_at_a_hem_if_it_is_better_so(tried):
+    laid, better, best = way(0.5), way(0.4), way(0.35)
+    assert tried(laid, better, way(0.6)) is better
+    assert tried(laid, way(0.6), way(0.7)) is laid
+    assert tried(laid, better, best) is best
+    good = way(0.2)
+    assert tried(laid, good) is good  # and is not laid flat anew
+    assert tried(good, way(0.25)) is good
+
+
+def test_a_way_is_cut_only_where_that_may_help(tried):
+    laid = way(0.5)
+    assert tried(laid, hem=None) is laid and tried(laid, grouped=None) is laid
+    for hopeless in (way(3.0, misfit=1.0), way(3.0, fitted=False), way(6.0)):
+        assert tried(hopeless) is hopeless

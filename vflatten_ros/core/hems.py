@@ -93,11 +93,22 @@ def hem_within(unfolded: Unfolded, fit: Fit, config: RotationConfig) -> Hem | No
 
 
 def cut_at_hem(
-    unfolded: Unfolded, hem: Hem, config: RotationConfig, progress: Progress = no_progress
+    unfolded: Unfolded,
+    hem: Hem,
+    anew: bool,
+    config: RotationConfig,
+    progress: Progress = no_progress,
 ) -> Grouped | None:
     """The surface without the links that lead across a hem, on either side of the item.
 
-    What lay inside of it lies as it did; what lay beyond has no place until it is laid flat again.
+    Parameters
+    ----------
+    unfolded : Unfolded
+    hem : Hem
+    anew : bool
+        Whether all is laid flat from the start, in place of from how it lay inside of the hem.
+    config : RotationConfig
+    progress : Progress
 
     Returns
     -------
@@ -119,10 +130,11 @@ def cut_at_hem(
     order = [k for k in np.argsort(-size, kind="stable") if size[k] > SMALLEST * count]
     masks = tuple(piece == k for k in order)
     places = np.full((count, 2), np.nan)
-    places[row] = unfolded.points.uv
-    places[~(masks[0] & (depth > 0.0))] = np.nan
-    flat = each_flat(surface, kept, masks[1:], config, progress)
-    for mask, uv in zip(masks[1:], flat, strict=True):
+    if not anew:  # what lay beyond has no place until it is laid flat again
+        places[row] = unfolded.points.uv
+        places[~(masks[0] & (depth > 0.0))] = np.nan
+    loose = masks if anew else masks[1:]
+    for mask, uv in zip(loose, each_flat(surface, kept, loose, config, progress), strict=True):
         places[mask] = uv[mask]
     return Grouped(surface, kept, masks, places)
 

@@ -52,6 +52,7 @@ WAYS = (  # draw of the samples, greatest doubt of what joins pieces
 FINER = 0.8  # spacing of the samples drawn again, in that of the first
 WORTH_PLACING = 0.1  # share of the samples of a group
 HOPELESS = 0.8  # misfit of the largest group, above which none is: that group is laid out wrong
+WORTH_CUTTING = 5.0  # badness up to which a way may be wrong about a hem only
 PLACED_WAYS = 2  # categories by which groups are placed that are looked at, if they are as likely
 LEAST_ODDS = 1e-3  # as this, against the likeliest
 
@@ -138,18 +139,22 @@ class _Draw:
         ------
         DisconnectedSurface
         """
-        tried, config = self._laid(doubt, progress), self._config
-        fit = tried.found.fit
-        if fit is None or fit.misfit > HOPELESS:
-            return tried
-        hem = hem_within(tried.unfolded, fit, config.rotation)
+        best = self._laid(doubt, progress)
+        fit, config = best.found.fit, self._config.rotation
+        if fit is None or fit.misfit > HOPELESS or best.badness > WORTH_CUTTING:
+            return best
+        hem = hem_within(best.unfolded, fit, config)
         if hem is None:
-            return tried
-        grouped = cut_at_hem(tried.unfolded, hem, config.rotation, progress)
-        if grouped is None:
-            return tried
-        cut = self._from_groups(grouped, progress)
-        return min((tried, cut), key=lambda one: one.badness)
+            return best
+        laid = best.unfolded
+        for anew in (False, True):
+            grouped = cut_at_hem(laid, hem, anew, config, progress)
+            if grouped is None:
+                break
+            best = min((best, self._from_groups(grouped, progress)), key=lambda one: one.badness)
+            if not best.untrusted:
+                break
+        return best
 
     def _laid(self, doubt: float, progress: Progress) -> Tried:
         config = self._config

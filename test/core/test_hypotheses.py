@@ -74,9 +74,10 @@ def tried(
         parts=(part(0.0),) * (parts - 1) + (part(creased),),
     )
     points.xyz_hanger[::2, 2] += torn_m
+    likely, other = ("skirt", "towel") if category == "skirt" else ("towel", "skirt")
     found = SimpleNamespace(
         category=category,
-        probabilities={"towel": sure, "skirt": 1.0 - sure, "unknown": 0.0},
+        probabilities={likely: sure, other: 1.0 - sure, "unknown": 0.0},
         fit=SimpleNamespace(
             misfit=misfit,
             explained=explained,
@@ -523,9 +524,8 @@ def test_the_helper_is_stopped_when_the_caller_stops(numbered):
     assert helper.log == ["begin", "end"]
 
 
-@pytest.mark.parametrize("legs", [False, True])
-def test_groups_that_lie_like_a_skirt_and_are_legs_are_none(monkeypatch, legs):
-    """A category that they rule out takes no probability from the others either."""
+def placed(monkeypatch, costs, legs=False, even=0.0):
+    """The best that comes of two groups, and by which categories they were laid beside."""
     known = {template.category: template for template in load_templates()}
     placings = [
         SimpleNamespace(
@@ -536,7 +536,7 @@ def test_groups_that_lie_like_a_skirt_and_are_legs_are_none(monkeypatch, legs):
             pose=np.zeros(3),
             state=np.zeros(known[name].dimensions),
         )
-        for name, cost in (("skirt", 0.0), ("shorts", 1.0))
+        for name, cost in costs.items()
     ]
     seen = []
 
@@ -549,7 +549,7 @@ def test_groups_that_lie_like_a_skirt_and_are_legs_are_none(monkeypatch, legs):
         )
         return replace(one, found=found)
 
-    monkeypatch.setattr(ways, "link_surface", lambda *_: SimpleNamespace(even=0.0))
+    monkeypatch.setattr(ways, "link_surface", lambda *_: SimpleNamespace(even=even))
     group = SimpleNamespace(points=None, side=None, outline=None)
     monkeypatch.setattr(ways, "unfold_group", lambda *_: group)
     monkeypatch.setattr(ways, "Group", lambda *_: None)
@@ -561,9 +561,24 @@ def test_groups_that_lie_like_a_skirt_and_are_legs_are_none(monkeypatch, legs):
     monkeypatch.setattr(ways, "_recognised", recognised)
     draw = ways._Draw(ways.Task(0, tuple(known.values()), Config()), 0, lambda *_: None)
     grouped = SimpleNamespace(masks=(np.ones(9, dtype=bool), np.ones(9, dtype=bool)))
-    best = draw._from_groups(grouped, lambda *_: None)
+    return draw._from_groups(grouped, lambda *_: None), seen
+
+
+@pytest.mark.parametrize("legs", [False, True])
+def test_groups_that_lie_like_a_skirt_and_are_legs_are_none(monkeypatch, legs):
+    """A category that they rule out takes no probability from the others either."""
+    best, seen = placed(monkeypatch, {"skirt": 0.0, "shorts": 1.0}, legs)
     shorts = best.found.probabilities.get("shorts", 0.0)
     if legs:
         assert ("skirt",) not in seen and shorts == pytest.approx(1.0)
     else:
         assert ("skirt",) in seen and shorts == pytest.approx(1.0 / (1.0 + np.e))
+
+
+def test_groups_of_one_cloth_are_a_towel_though_they_lie_as_well_like_a_skirt(monkeypatch):
+    costs = {"skirt": 0.0, "towel": 2.0}
+    assert placed(monkeypatch, costs)[0].found.category == "skirt"
+    best, seen = placed(monkeypatch, costs, even=0.83)
+    assert ("skirt",) in seen  # as bad, but that it is unlikely
+    assert best.found.category == "towel"
+    assert best.sure == best.found.probabilities["towel"] > 0.9

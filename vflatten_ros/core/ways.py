@@ -18,7 +18,7 @@ from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold
 from vflatten_ros.core.hems import cut_at_hem, hem_within
 from vflatten_ros.core.middle_slit import axes_of
 from vflatten_ros.core.necks import cut_at_neck
-from vflatten_ros.core.placing import Group, place_groups, turned_over
+from vflatten_ros.core.placing import Group, Placing, place_groups, turned_over
 from vflatten_ros.core.recognition import (
     UNKNOWN,
     Recognition,
@@ -181,13 +181,12 @@ class _Draw:
             return alone
         laid += [unfold_group(grouped, k, config.rotation, progress) for k in large]
         groups = [Group(one.points, one.side, one.outline) for one in laid]
-        placings = place_groups(groups, self._templates, config, progress)
-        least = placings[0].cost
-        even = self._linked.even
-        odds = {
-            p.template.category: float(np.exp(least - p.cost - of_one_cloth(p.template, even)))
-            for p in placings
-        }
+
+        def cost(placing: Placing) -> float:
+            return placing.cost + of_one_cloth(placing.template, self._linked.even)
+
+        placings = sorted(place_groups(groups, self._templates, config, progress), key=cost)
+        odds = {p.template.category: float(np.exp(cost(placings[0]) - cost(p))) for p in placings}
         placed = []
         for placing in placings[:PLACED_WAYS]:
             if odds[placing.template.category] < LEAST_ODDS:

@@ -9,8 +9,9 @@ from flat import lying_at
 from vflatten_ros.categories import load_templates
 from vflatten_ros.core.config import RecognitionConfig, RotationConfig
 from vflatten_ros.core.faces import MOST, ONE_CLOTH, evenly_apart
-from vflatten_ros.core.recognition import recognise
+from vflatten_ros.core.recognition import MOST_OF_ONE_CLOTH, of_one_cloth, recognise
 from vflatten_ros.core.values import Outline
+from vflatten_ros.core.ways import _chance
 
 CONFIG = RotationConfig()
 WIDE_M, LONG_M, WAVE_M = 0.3, 0.5, 0.02
@@ -80,3 +81,19 @@ def test_one_cloth_that_lies_askew_is_a_towel_and_no_skirt():
     assert found(0.0).probabilities == pytest.approx(found(ONE_CLOTH).probabilities)
     assert found(0.95).category == "towel" and found(0.95).probabilities["towel"] > 0.9
     assert found(0.95).one_cloth and not found(0.0).one_cloth
+
+
+def test_one_cloth_costs_a_garment_odds_but_is_no_proof():
+    known = {template.category: template for template in load_templates()}
+    towel, shorts = known["towel"], known["shorts"]
+    assert of_one_cloth(towel, 1.0) == of_one_cloth(shorts, ONE_CLOTH) == 0.0
+    assert 0.0 < of_one_cloth(shorts, ONE_CLOTH + 0.03) < of_one_cloth(shorts, 1.0)
+    assert of_one_cloth(shorts, 0.95) == of_one_cloth(shorts, 1.0) == MOST_OF_ONE_CLOTH
+
+
+def test_of_one_cloth_only_clear_signs_of_a_slit_count():
+    templates = load_templates()
+    assert _chance(0.9, templates, 0.5) == pytest.approx(0.9)
+    assert _chance(0.9, templates, 1.0) == pytest.approx(9.0 / (9.0 + np.exp(MOST_OF_ONE_CLOTH)))
+    assert _chance(0.9999, templates, 1.0) > 0.5
+    assert [_chance(p, templates, 1.0) for p in (0.0, 1.0)] == [0.0, 1.0]

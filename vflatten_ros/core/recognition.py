@@ -36,6 +36,7 @@ DOUBLED = 60.0  # what a doubled share above MISLAID costs a single sheet (log o
 OF_ONE_CLOTH = (
     75.0  # what faces that are more evenly apart than ONE_CLOTH cost a garment (log odds)
 )
+MOST_OF_ONE_CLOTH = 7.0  # thin layers may cling to each other all over
 WORTH_WEIGHING = 1e-4  # probability of a category before loose parts were turned
 HOPELESS = 40.0  # a category with this much more energy than the best is not refined with care
 COARSE = (((12.0, 9.0), 16), ((6.0, 6.0), BEST))  # cuts of the steps, in sigmas; hypotheses kept
@@ -309,7 +310,8 @@ def _edge_distances(evidence: Evidence, outline: Float) -> tuple[Float, Float]:
 
 def of_one_cloth(template: Template, even: float) -> float:
     """What it costs a garment with a front and a back that the item seems one cloth (log odds)."""
-    return 0.0 if template.single_sheet else OF_ONE_CLOTH * max(0.0, even - ONE_CLOTH)
+    cost = OF_ONE_CLOTH * max(0.0, even - ONE_CLOTH)
+    return 0.0 if template.single_sheet else min(cost, MOST_OF_ONE_CLOTH)
 
 
 def _probabilities(

@@ -243,6 +243,12 @@ def _slit_or_not(
     return {name: p / sum(told.values()) for name, p in told.items()}
 
 
+def _chance(slit: float, templates: Sequence[Template], even: float) -> float:
+    """Probability of a slit between legs, by its signs and how evenly apart the faces hang."""
+    against = max((of_one_cloth(t, even) for t in templates if t.parts), default=0.0)
+    return float(slit / (slit + (1.0 - slit) * np.exp(against)))
+
+
 def _recognised(
     unfolded: Unfolded,
     templates: tuple[Template, ...],
@@ -256,13 +262,13 @@ def _recognised(
         return recognise(outline, points, templates, settings, progress, begin, even)
 
     found = named(unfolded)
-    fit = found.fit
-    if begin is None and fit is not None and not fit.template.parts and not found.one_cloth:
+    if begin is None and (fit := found.fit) is not None and not fit.template.parts:
         outline = fit.points()[: fit.template.vertices]
         axes = axes_of(outline, fit.pose, across=fit.template.single_sheet)
         cut = parted(unfolded, axes, config.rotation)  # are these legs?
         if cut is not None:
-            legs, chance = named(cut[0]), cut[1]
+            legs = named(cut[0])
+            chance = _chance(cut[1], templates, unfolded.surface.even)
             told = _slit_or_not(found, legs, chance, templates)
             if chance > 0.5:
                 unfolded, found = cut[0], legs

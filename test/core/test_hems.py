@@ -10,6 +10,7 @@ import pytest
 from vflatten_ros.core import ways
 from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.distances import link_steps
+from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.grouping import unfold_group
 from vflatten_ros.core.hems import Hem, cut_at_hem, hem_within
 from vflatten_ros.core.rotation import Surface, unfold_surface
@@ -124,8 +125,15 @@ def tried(monkeypatch):
 
     def of(laid, *cut, hem="hem", grouped="grouped"):
         left = iter(cut)
+
+        def from_groups(*_):
+            found = next(left)
+            if isinstance(found, DisconnectedSurface):
+                raise found
+            return found
+
         monkeypatch.setattr(ways._Draw, "_laid", lambda *_: laid)
-        monkeypatch.setattr(ways._Draw, "_from_groups", lambda *_: next(left))
+        monkeypatch.setattr(ways._Draw, "_from_groups", from_groups)
         monkeypatch.setattr(ways, "hem_within", lambda *_: hem)
         monkeypatch.setattr(ways, "cut_at_hem", lambda *_: grouped)
         draw = ways._Draw.__new__(ways._Draw)
@@ -143,6 +151,12 @@ def test_a_way_is_cut_at_a_hem_if_it_is_better_so(tried):
     good = way(0.2)
     assert tried(laid, good) is good  # and is not laid flat anew
     assert tried(good, way(0.25)) is good
+
+
+def test_a_way_that_the_cut_leaves_in_shreds_stays_as_it_was(tried):
+    laid, shreds = way(0.5), DisconnectedSurface("in shreds")
+    assert tried(laid, shreds) is laid
+    assert tried(laid, better := way(0.4), shreds) is better
 
 
 def test_a_way_is_cut_only_where_that_may_help(tried):

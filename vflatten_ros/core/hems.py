@@ -113,7 +113,7 @@ def cut_at_hem(
     Returns
     -------
     Grouped or None
-        None: nothing leads across.
+        None: nothing leads across, or what is left is in shreds.
     """
     surface, row = unfolded.surface, unfolded.row
     links, count = surface.links, len(surface.edge)
@@ -128,6 +128,8 @@ def cut_at_hem(
     piece = connected_components(graph, directed=False)[1]
     size = np.bincount(piece)
     order = [k for k in np.argsort(-size, kind="stable") if size[k] > SMALLEST * count]
+    if not order:
+        return None
     masks = tuple(piece == k for k in order)
     places = np.full((count, 2), np.nan)
     if not anew:  # what lay beyond has no place until it is laid flat again

@@ -7,6 +7,7 @@ then lies flat, and is one of a kind that exists, can.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -147,13 +148,15 @@ class _Draw:
         if hem is None:
             return best
         laid = best.unfolded
-        for anew in (False, True):
-            grouped = cut_at_hem(laid, hem, anew, config, progress)
-            if grouped is None:
-                break
-            best = min((best, self._from_groups(grouped, progress)), key=lambda one: one.badness)
-            if not best.untrusted:
-                break
+        with suppress(DisconnectedSurface):  # it is as good as before
+            for anew in (False, True):
+                grouped = cut_at_hem(laid, hem, anew, config, progress)
+                if grouped is None:
+                    break
+                cut = self._from_groups(grouped, progress)
+                best = min((best, cut), key=lambda one: one.badness)
+                if not best.untrusted:
+                    break
         return best
 
     def _laid(self, doubt: float, progress: Progress) -> Tried:

@@ -70,7 +70,7 @@ class Verdict:
 
     category: str
     badness: float
-    sure: float  # probability of its category
+    sure: float  # probability of the likeliest category
     parts: int  # groups that only the category joins, or 1
     unseen: float  # share of the outline that no view shows
     size_m: tuple[float, float] = (0.0, 0.0)  # width and length; 0: none
@@ -194,9 +194,9 @@ class Tried:
 
     @property
     def sure(self) -> float:
-        """Probability of its category, or of the likeliest if it is unknown."""
-        known = {n: p for n, p in self.found.probabilities.items() if n != UNKNOWN}
-        return known.get(self.found.category, max(known.values(), default=0.0))
+        """Probability of the likeliest category."""
+        known = [p for name, p in self.found.probabilities.items() if name != UNKNOWN]
+        return max(known, default=0.0)
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.errors import DisconnectedSurface
+from vflatten_ros.core.faces import ONE_CLOTH
 from vflatten_ros.core.fused import Fused, drawn_again
 from vflatten_ros.core.grouping import Grouped, group_pieces, put_beside, unfold_group
 from vflatten_ros.core.hems import cut_at_hem, hem_within
@@ -190,6 +191,8 @@ class _Draw:
 
         placings = sorted(place_groups(groups, self._templates, config, progress), key=cost)
         odds = {p.template.category: float(np.exp(cost(placings[0]) - cost(p))) for p in placings}
+        if placings[0].template.single_sheet and self._linked.even >= ONE_CLOTH:
+            placings = placings[:1]  # as well as a garment may lie
         placed = []
         for placing in placings[:PLACED_WAYS]:
             if odds[placing.template.category] < LEAST_ODDS:

@@ -33,10 +33,9 @@ FREEDOM = 25.0  # of an ordinary category: what its pose and sizes cost in evide
 AS_CUT = 0.2  # of the swing of parts, where nothing turned them
 UNEXPLAINED = 1.5  # what an observation that only others explain costs a category (log odds)
 DOUBLED = 60.0  # what a doubled share above MISLAID costs a single sheet (log odds)
-OF_ONE_CLOTH = (
-    75.0  # what faces that are more evenly apart than ONE_CLOTH cost a garment (log odds)
-)
-MOST_OF_ONE_CLOTH = 7.0  # thin layers may cling to each other all over
+# What faces more evenly apart than ONE_CLOTH cost a garment (log odds): for each 1, and at most,
+# since thin layers may cling to each other all over
+OF_ONE_CLOTH, MOST_OF_ONE_CLOTH = 75.0, 7.0
 WORTH_WEIGHING = 1e-4  # probability of a category before loose parts were turned
 HOPELESS = 40.0  # a category with this much more energy than the best is not refined with care
 COARSE = (((12.0, 9.0), 16), ((6.0, 6.0), BEST))  # cuts of the steps, in sigmas; hypotheses kept

@@ -109,6 +109,52 @@ def test_a_hem_that_nothing_leads_across_needs_no_cut(flush):
     assert cut_at_hem(flush, below, False, CONFIG) is None
 
 
+def lying(xyz_m, links, edge, row=None):
+    """A surface that lies as it was made; of some samples nobody knows where."""
+    count = len(xyz_m)
+    samples = SimpleNamespace(xyz=xyz_m, normal=np.sign(xyz_m[:, 2:]) * [0.0, 0.0, 1.0])
+    none = np.zeros(count, dtype=np.int64)
+    row = np.arange(count) if row is None else row
+    return SimpleNamespace(
+        surface=Surface(samples, links, None, edge, none, none, none),
+        row=row,
+        points=SimpleNamespace(uv=xyz_m[row, :2]),
+        side=np.sign(xyz_m[row, 2]),
+    )
+
+
+def test_the_sides_of_the_item_are_looked_at_each_by_itself():
+    """A third of the front ends above the hem of a back that goes on."""
+    front, back = sheet(0.12, 0.0, LENGTH_M, 1), sheet(WIDTH_M, -FLAP[2], LENGTH_M, 2)
+    flat = np.vstack([front, back])
+    height = np.r_[np.full(len(front), 0.003), np.full(len(back), -0.003)]
+    xyz = np.column_stack([flat, height])
+    normal = np.sign(xyz[:, 2:]) * [0.0, 0.0, 1.0]
+    links = link_samples(xyz, normal, CONFIG)
+    links = links.part(~links.rim)
+    edge = sheet_edges(xyz, normal, links.a, links.b, CONFIG)
+    alone = len(front)
+    hem = hem_within(lying(xyz, links, edge), fitted(-FLAP[2]), CONFIG)
+    assert hem.depth_m == pytest.approx(FLAP[2], abs=CONFIG.spacing_m)
+    without = links.among(np.arange(len(xyz)) < alone)
+    only = hem_within(lying(xyz[:alone], without, edge[:alone]), fitted(-FLAP[2]), CONFIG)
+    assert hem.clear == pytest.approx(only.clear)
+
+
+def test_what_lay_beyond_a_hem_and_hangs_on_otherwise_has_no_place_yet(flush):
+    surface = flush.surface
+    xyz = surface.samples.xyz
+    row = np.flatnonzero(np.abs(xyz[:, 0] - 0.14) > 0.01)  # what joins both was not placed
+    some = lying(xyz, surface.links, surface.edge, row)
+    some.surface = surface
+    cut = cut_at_hem(some, Hem(np.zeros(2), np.array([0.0, 1.0]), 0.0, 9.0), False, CONFIG)
+    assert len(cut.masks) == 1 and cut.masks[0].mean() > 0.99
+    beyond = row[xyz[row, 1] < -0.01]
+    inside = row[xyz[row, 1] > 0.01]
+    assert len(beyond) > 100 and np.isnan(cut.places[beyond]).all()
+    assert np.array_equal(cut.places[inside], xyz[inside, :2])
+
+
 def way(badness, misfit=0.0, fitted=True):
     fit = SimpleNamespace(misfit=misfit) if fitted else None
     return SimpleNamespace(

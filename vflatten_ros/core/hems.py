@@ -13,15 +13,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.distances import largest_pieces
 from vflatten_ros.core.geometry import twice_area
 from vflatten_ros.core.grouping import SMALLEST, Grouped, each_flat
 from vflatten_ros.core.rotation import Unfolded, as_laid
+from vflatten_ros.core.sheets import outward
 from vflatten_ros.core.template_fit import Fit
-from vflatten_ros.core.values import Bool, Float, Progress, no_progress
+from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 STEP, CELL = 0.6, 2.0  # of depths, and of stretches along an edge, in spacings of the samples
 REACH = 1  # steps to either side that are of one depth
@@ -40,7 +40,7 @@ CLEAR = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Hem:
-    """A straight edge within the flat surface."""
+    """A straight edge within the flat surface, in the plane in which that lies."""
 
     start: Float  # (2,) one end of the category's opening, m
     inward: Float  # (2,) unit, from there into the item
@@ -65,7 +65,7 @@ def hem_within(unfolded: Unfolded, fit: Fit, config: RotationConfig) -> Hem | No
         None: there is none that is clear enough.
     """
     uv, side = unfolded.points.uv, unfolded.side
-    ends, outward = _ends(unfolded, config)
+    ends, towards = _ends(unfolded, config)
     step, cell = STEP * config.spacing_m, CELL * config.spacing_m
     count = int((MOST_M + LEAST_M) / step) + 1
     depth_m = -LEAST_M + step * np.arange(count)  # and outside, for comparison
@@ -78,7 +78,7 @@ def hem_within(unfolded: Unfolded, fit: Fit, config: RotationConfig) -> Hem | No
         row = np.rint(((uv - start) @ inward + LEAST_M) / step).astype(int)
         columns = int(length / cell)
         within = (column >= 0) & (column < columns) & (row >= 0) & (row < count)
-        faces = ends & (outward @ inward < -FACING)
+        faces = ends & (towards @ inward < -FACING)
         for up in (1.0, -1.0):
             layer = within & (side == up)
             cloth = _cells(row, column, layer, (count, columns))
@@ -117,24 +117,20 @@ def cut_at_hem(
     """
     surface, row = unfolded.surface, unfolded.row
     links, count = surface.links, len(surface.edge)
-    depth = np.full(count, np.nan)
+    depth_m = np.full(count, np.nan)  # inside of the cut
     cut_m = hem.depth_m - PAST * config.spacing_m
-    depth[row] = (unfolded.points.uv - hem.start) @ hem.inward - cut_m
-    across = depth[links.a] * depth[links.b] < 0.0
+    depth_m[row] = (unfolded.points.uv - hem.start) @ hem.inward - cut_m
+    across = depth_m[links.a] * depth_m[links.b] < 0.0
     if not across.any():
         return None
     kept = links.part(~across)
-    graph = csr_matrix((np.ones(len(kept.a)), (kept.a, kept.b)), shape=(count, count))
-    piece = connected_components(graph, directed=False)[1]
-    size = np.bincount(piece)
-    order = [k for k in np.argsort(-size, kind="stable") if size[k] > SMALLEST * count]
-    if not order:
+    masks = tuple(largest_pieces(kept, np.ones(count, dtype=bool), int(SMALLEST * count)))
+    if not masks:
         return None
-    masks = tuple(piece == k for k in order)
     places = np.full((count, 2), np.nan)
     if not anew:  # what lay beyond has no place until it is laid flat again
         places[row] = unfolded.points.uv
-        places[~(masks[0] & (depth > 0.0))] = np.nan
+        places[~(masks[0] & (depth_m > 0.0))] = np.nan
     loose = masks if anew else masks[1:]
     for mask, uv in zip(loose, each_flat(surface, kept, loose, config, progress), strict=True):
         places[mask] = uv[mask]
@@ -142,7 +138,10 @@ def cut_at_hem(
 
 
 def _openings(fit: Fit) -> Iterator[tuple[Float, Float, Float]]:
-    """Straight stretches of the category's outline where its cloth ends: ends, and inward."""
+    """Straight stretches of the category's outline where its cloth ends.
+
+    Each as its two ends (2,), m, and the unit direction (2,) from it into the item.
+    """
     outline = fit.points()[: fit.template.vertices]
     step = np.roll(outline, -1, axis=0) - outline
     step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
@@ -160,22 +159,19 @@ def _openings(fit: Fit) -> Iterator[tuple[Float, Float, Float]]:
 
 
 def _ends(unfolded: Unfolded, config: RotationConfig) -> tuple[Bool, Float]:
-    """Samples at whose places their cloth ends, and (n, 2) in which direction of the plane."""
+    """Samples (n,) at whose places their cloth ends, and (n, 2) unit directions of it."""
     uv = unfolded.points.uv
     edge, links = as_laid(unfolded.surface, unfolded.row, uv)
     sheet = links.part(~links.rim)
     away = uv[sheet.b] - uv[sheet.a]
-    near = np.linalg.norm(away, axis=1) < NEAR * config.spacing_m
-    a, b, away = sheet.a[near], sheet.b[near], away[near]
-    outward = np.column_stack(
-        [np.bincount(b, along, len(uv)) - np.bincount(a, along, len(uv)) for along in away.T]
-    )
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-    return edge == 1, outward
+    near = sheet.part(np.linalg.norm(away, axis=1) < NEAR * config.spacing_m)
+    flat = np.column_stack([uv, np.zeros(len(uv))])
+    up = np.broadcast_to([0.0, 0.0, 1.0], flat.shape)
+    return edge == 1, outward(flat, up, near.a, near.b)[:, :2]
 
 
-def _cells(row: Float, column: Float, some: Bool, shape: tuple[int, int]) -> Bool:
-    """Cells in which some samples lie, or that are within reach of such in depth."""
+def _cells(row: Int, column: Int, some: Bool, shape: tuple[int, int]) -> Bool:
+    """Cells (rows, columns) in which some of (n,) samples lie, or within reach of such in depth."""
     cells = np.zeros((shape[0] + 2 * REACH, shape[1]), dtype=bool)
     for shift in range(2 * REACH + 1):
         cells[row[some] + shift, column[some]] = True

@@ -74,7 +74,7 @@ def test_the_planners_round_gives_what_replay_gives(ros, tmp_path, method, rate,
         helpers = rig.node.helpers()
         cores = len(os.sched_getaffinity(0))
         assert len(helpers) == (method == "rotation" and cores > 1)
-        assert all(cpu_s(helper) > 2.0 for helper in helpers)  # loading takes less than one
+        assert all(cpu_s(helper) > 1.0 for helper in helpers)  # loading takes less
         assert rig.node.stop() == 0
         assert all(gone(helper) for helper in helpers)
         assert "helper" not in rig.node.log()  # it had no trouble

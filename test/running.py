@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 
@@ -13,12 +12,6 @@ def children_of(pid, word):
     return [
         int(child) for child in text.split() if word in Path(f"/proc/{child}/cmdline").read_bytes()
     ]
-
-
-def cpu_s(pid):
-    """CPU time that a process has used."""
-    fields = _fields(pid)
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def gone(pid, within_s=20.0):

@@ -14,7 +14,9 @@ import garments
 from vflatten_ros.worker import STOP
 
 ENOUGH = 10  # views
-GOOD, SLOW, STUBBORN, CRASH, WRONG, MISTAKE, SILENT = 30, 31, 32, 33, 34, 35, 36
+GOOD, SLOW, STUBBORN, CRASH, WRONG, MISTAKE, SILENT, ENDLESS = range(30, 38)
+STEP_S = 0.02
+HOURS_S = 1e4  # longer than any test waits
 
 
 def load():
@@ -48,14 +50,15 @@ def example_or_trouble(what, progress):
         signal.pthread_sigmask(signal.SIG_BLOCK, {STOP})  # as a long computation in C
     progress("work", 0.0)
     if what in (SILENT, STUBBORN):
-        time.sleep(30.0)  # without a word
+        time.sleep(HOURS_S)  # without a word
     if what == CRASH:
         os._exit(7)
     if what == WRONG:
         raise NotEnoughViews("three views are needed")
     if what == MISTAKE:
         raise ZeroDivisionError("a mistake of ours")
-    for step in range(100 if what == SLOW else 2):
-        progress("work", step / 100)
-        time.sleep(0.02)
+    steps = {SLOW: 100, ENDLESS: int(HOURS_S / STEP_S)}.get(what, 2)
+    for step in range(steps):
+        progress("work", step / steps)
+        time.sleep(STEP_S)
     return garments.example_garment()

@@ -13,6 +13,7 @@ import garments
 import pytest
 import slow_work
 
+from vflatten_ros import goals
 from vflatten_ros.core.config import Config, GeodesicConfig
 from vflatten_ros.goals import CANCEL_GRACE_S, Goals, Listener, Task
 from vflatten_ros.worker import Worker
@@ -144,15 +145,14 @@ def test_errors_of_the_method_are_told_and_the_next_task_goes_on(office):
     assert office.answer(office.ask(slow_work.GOOD)).garment
 
 
-@pytest.mark.parametrize("work", [slow_work.SLOW, slow_work.SILENT])
-def test_a_cancelled_task_stops_and_the_process_stays(office, work):
+@pytest.mark.parametrize("work", [slow_work.ENDLESS, slow_work.SILENT])
+def test_a_cancelled_task_stops_and_the_process_stays(office, work, monkeypatch):
+    monkeypatch.setattr(goals, "CANCEL_GRACE_S", 1e3)  # it is not ended, however slow the machine
     asker = office.ask(work)
     office.until(lambda: ("work", 0.0) in asker.steps)
     restarts = office.goals.restarts
     office.goals.withdraw(asker.listener)
-    began = time.monotonic()
-    office.until(lambda: not office.goals.busy)
-    assert time.monotonic() - began < 2.0  # it would have taken longer
+    office.until(lambda: not office.goals.busy)  # the work itself never ends
     assert office.goals.restarts == restarts
     assert not asker.outcomes
 
@@ -171,7 +171,7 @@ def test_a_process_that_does_not_stop_is_ended_and_the_next_task_is_done(office)
     began = time.monotonic()
     office.goals.withdraw(asker.listener)
     office.until(lambda: not office.goals.busy)
-    assert CANCEL_GRACE_S <= time.monotonic() - began < 10.0
+    assert time.monotonic() - began >= CANCEL_GRACE_S
     assert any("did not stop" in line for line in office.log)
     assert office.answer(office.ask(slow_work.GOOD)).garment
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recordings import BAGS
-from running import cpu_s, gone
+from running import gone
 
 from vflatten_ros import helper as helping
 from vflatten_ros.bag import gather_views, open_recording
@@ -94,7 +94,6 @@ def test_two_processes_give_what_one_gives_to_the_bit(item, helper, monkeypatch)
         HelperProcess, "laid_flat", lambda self, k: (fetched.append(k), laid_flat(self, k))[1]
     )
     assert item.tried.count("link") > 2 and item.tried.count("ramps") > 1  # both draws
-    before = cpu_s(helper.pid)
 
     def patient(stage, fraction):
         """The caller is late at its first way: the helper does all of its own."""
@@ -102,8 +101,7 @@ def test_two_processes_give_what_one_gives_to_the_bit(item, helper, monkeypatch)
             time.sleep(0.02)
 
     assert alike(item.flattened(helper, patient), item.alone) == []
-    assert cpu_s(helper.pid) - before > 0.3  # it took part
-    assert fetched  # and had the best way
+    assert fetched  # it took part, and had the best way
     assert alike(item.flattened(helper), item.alone) == []  # and forgot what was before
 
 

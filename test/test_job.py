@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import garments
 import pytest
 
-from vflatten_ros import job
+from vflatten_ros import helper, job
 from vflatten_ros.core import pipeline, registration
 from vflatten_ros.core.config import Config, RotationConfig
 from vflatten_ros.core.errors import NotEnoughViews
@@ -21,7 +21,7 @@ COARSE = dataclasses.replace(CONFIG, rotation=RotationConfig(view_fit_m=0.02))
 @pytest.fixture
 def calls(monkeypatch):
     """The method replaced by notes of how it was called."""
-    noted = SimpleNamespace(prepared=[], given=None, folded=[], so_far=None)
+    noted = SimpleNamespace(prepared=[], given=None, folded=[], so_far=None, helper=None)
 
     def prepare_view(view, config):
         noted.prepared.append(view.view_id)
@@ -32,7 +32,7 @@ def calls(monkeypatch):
         return tuple(surfaces)
 
     def flatten_garment(views, pairs, templates, config, progress, prepared, so_far, helper):
-        noted.given, noted.so_far = dict(prepared), so_far
+        noted.given, noted.so_far, noted.helper = dict(prepared), so_far, helper
         return garments.example_garment()
 
     monkeypatch.setattr(pipeline, "prepare_view", prepare_view)
@@ -56,6 +56,16 @@ def test_a_view_is_prepared_once_and_given_to_the_method(calls):
         flatten(work, (first, second), CONFIG)
     assert calls.prepared == [first.view_id, second.view_id]
     assert calls.given == {v.view_id: f"surface of {v.view_id}" for v in (first, second)}
+
+
+@pytest.mark.parametrize("processes, cores, helped", [(1, 2, False), (2, 1, False), (2, 2, True)])
+def test_the_method_is_given_a_helper_where_a_second_process_is_of_use(
+    calls, monkeypatch, processes, cores, helped
+):
+    monkeypatch.setattr(helper, "HelperProcess", lambda: "a helper")
+    monkeypatch.setattr(helper.os, "sched_getaffinity", lambda pid: set(range(cores)))
+    flatten(job.load("", processes), garments.example_views(), CONFIG)
+    assert calls.helper == ("a helper" if helped else None)
 
 
 def test_what_was_prepared_with_other_settings_is_not_used(calls):

@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from rclpy.serialization import deserialize_message
 from ros_rig import CALIBRATION, REAL, RECORDING, ROOT, Process, Rig
-from running import cpu_s, gone
+from running import gone
 from vflatten_ros.msg import FlattenedView, GarmentEstimate, Status
 
 from vflatten_ros import messages
@@ -74,7 +74,6 @@ def test_the_planners_round_gives_what_replay_gives(ros, tmp_path, method, rate,
         helpers = rig.node.helpers()
         cores = len(os.sched_getaffinity(0))
         assert len(helpers) == (method == "rotation" and cores > 1)
-        assert all(cpu_s(helper) > 1.0 for helper in helpers)  # loading takes less
         assert rig.node.stop() == 0
         assert all(gone(helper) for helper in helpers)
         assert "helper" not in rig.node.log()  # it had no trouble

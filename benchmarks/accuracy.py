@@ -1,9 +1,11 @@
 #!/usr/bin/env python3
 """How far results are from the truth of simulated recordings: writes docs/accuracy.md.
 
-    accuracy.py [FOLDER ...] [--runs rotation,half,...] [--jobs N] [--output FILE] [--about TEXT]
+    accuracy.py [NAME=FOLDER,... ...] [--runs rotation,half,...] [--jobs N] [--output FILE]
+                [--about TEXT] [--append]
 
-Each FOLDER is a recording with truth.json and truth.npz, or holds such recordings (default: bags/).
+Each argument is a group of recordings with a table of its own, "NAME=" left out: named as its first
+folder. Each FOLDER is a recording with truth.json and truth.npz, or holds such (default: bags/).
 Every recording is flattened with all views and no manual input (rotation), with every second view
 (half), by the paper's protocol (protocol), by the paper's method with views and points chosen by
 itself (chosen), with all views and a calibration that is off (calibration), and with all views and
@@ -105,29 +107,46 @@ class Row:
 def main() -> int:
     """Replay, compare, write the page."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folders", type=Path, nargs="*", default=[ROOT / "bags"])
+    parser.add_argument(
+        "groups", nargs="*", default=[str(ROOT / "bags")], metavar="NAME=FOLDER,..."
+    )
     parser.add_argument("--runs", default=",".join(RUNS), help="some of " + ",".join(RUNS))
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "accuracy.md")
     parser.add_argument("--about", default="", help="a paragraph about these recordings")
     parser.add_argument("--jobs", type=int, default=1, help="recordings at a time")
+    parser.add_argument("--append", action="store_true", help="add to the page, as it is")
     args = parser.parse_args()
     runs = args.runs.split(",")
     if not set(runs) <= set(RUNS):
         parser.error(f"--runs: expected some of {','.join(RUNS)}, got {args.runs}")
-    folders = list(recordings(args.folders))
-    if not folders:
-        print("accuracy: no recording with truth.json in the folders given", file=sys.stderr)
-        return 1
-    parts = [HEAD, *([args.about, ""] if args.about else [])]
+    groups = dict(map(group, args.groups))
+    folders = [folder for several in groups.values() for folder in several]
+    for name, several in groups.items():
+        if not several:
+            print(f"accuracy: no recording with truth.json in {name}", file=sys.stderr)
+            return 1
+    parts = [] if args.append else [HEAD, *([args.about, ""] if args.about else [])]
     with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
         for run in runs:
             pictures = args.output.with_suffix("") / run
             compared = pool.map(partial(compare, run=run, pictures=pictures), folders)
-            rows = [row for row in compared if row]
-            parts += section(RUNS[run], rows, f"{pictures.parent.name}/{run}")
-    args.output.write_text("\n".join(parts), encoding="utf-8")
+            rows = dict(zip(folders, compared, strict=True))
+            tables = {
+                name: [row for folder in several if (row := rows[folder])]
+                for name, several in groups.items()
+            }
+            parts += section(RUNS[run], tables, f"{pictures.parent.name}/{run}")
+    with args.output.open("a" if args.append else "w", encoding="utf-8") as page:
+        page.write("\n".join(parts))
     print(args.output)
     return 0
+
+
+def group(text: str) -> tuple[str, list[Path]]:
+    """Name and recordings of a group, as given on the command line."""
+    name, _, folders = text.rpartition("=")
+    paths = [Path(folder) for folder in folders.split(",")]
+    return name or paths[0].resolve().name, list(recordings(paths))
 
 
 def recordings(folders: Sequence[Path]) -> Iterator[Path]:
@@ -301,13 +320,15 @@ def landmark_error(truth: Mapping[str, Any], result: Mapping[str, Any]) -> float
     return None if best is None else float(np.median(best))
 
 
-def section(title: str, rows: Sequence[Row], pictures: str) -> list[str]:
-    """One run: its table, its figures of merit, and what failed."""
-    lines = [f"## {title}", "", *table(rows), "", *figures_of_merit(rows), ""]
-    for row in (row for row in rows if row.failed):
-        lines += [f"**{row.name}**: " + ("; ".join(row.notes) or "no notice"), ""]
-        if row.category != "failed":
-            lines += [f"![flattened {row.name}]({pictures}/{row.name}.png)", ""]
+def section(title: str, tables: Mapping[str, Sequence[Row]], pictures: str) -> list[str]:
+    """One run: its figures of merit, the table of each group, and what failed."""
+    lines = [f"## {title}", "", *figures_of_merit(tables), ""]
+    for name, rows in tables.items():
+        lines += [f"### {name[0].upper()}{name[1:]}", "", *table(rows), ""]
+        for row in (row for row in rows if row.failed):
+            lines += [f"**{row.name}**: " + ("; ".join(row.notes) or "no notice"), ""]
+            if row.category != "failed":
+                lines += [f"![flattened {row.name}]({pictures}/{row.name}.png)", ""]
     return lines
 
 
@@ -350,25 +371,52 @@ def _centimetres(value_m: float | None) -> str:
     return "" if value_m is None else f"{100 * value_m:.2f} cm"
 
 
-def figures_of_merit(rows: Sequence[Row]) -> list[str]:
-    """The means, over all recordings and over those that the result itself trusts."""
-    lines = []
-    for name, part in (("all", rows), ("trusted", [row for row in rows if row.trusted])):
-        sizes = [abs(e) for row in part for e in row.error_pct.values() if e is not None]
-        sigmas = [s for row in part for s in row.in_sigmas.values() if s is not None]
-        if not sizes:
-            continue
-        named = [row for row in part if "ends_alike" not in row.notes]
-        lines += [
-            f"- {name}, {len(part)} recordings: category right {sum(r.right for r in part)}; "
-            f"W and L given {len(sizes)} of {2 * len(part)}, error mean {np.mean(sizes):.1f} %, "
-            f"worst {max(sizes):.1f} %; within one σ {_share(sigmas, 1)}, within two "
-            f"{_share(sigmas, 2)}; means: points {_centimetres(_mean(part, 'point_median_m'))}, "
-            f"overlap {_mean(part, 'overlap') or 0:.3f}, "
-            f"landmarks {_centimetres(_mean(part, 'landmark_median_m'))} "
-            f"({_centimetres(_mean(named, 'landmark_median_m'))} where the ends differ)"
+def figures_of_merit(tables: Mapping[str, Sequence[Row]]) -> list[str]:
+    """Numbers and means of each group, of all, and of those that the result itself trusts."""
+    names = [
+        "recordings",
+        "",
+        "right",
+        "trusted",
+        "W, L: mean",
+        "worst",
+        "within one σ",
+        "within two",
+        "points",
+        "overlap",
+        "landmarks",
+    ]
+    lines = ["| " + " | ".join(names) + " |", "|" + " --- |" * len(names)]
+    everything = [row for rows in tables.values() for row in rows]
+    groups = {**tables, "all": everything}
+    if len(tables) == 1:
+        del groups["all"]
+    groups["those that are trusted"] = [row for row in everything if row.trusted]
+    for name, rows in groups.items():
+        sizes = [abs(e) for row in rows for e in row.error_pct.values() if e is not None]
+        sigmas = [s for row in rows for s in row.in_sigmas.values() if s is not None]
+        named = [row for row in rows if "ends_alike" not in row.notes]
+        cells = [
+            name,
+            f"{len(rows)}",
+            f"{sum(row.right for row in rows)}",
+            f"{sum(row.trusted for row in rows)}",
+            f"{np.mean(sizes):.1f} %" if sizes else "",
+            f"{max(sizes):.1f} %" if sizes else "",
+            _share(sigmas, 1) if sigmas else "",
+            _share(sigmas, 2) if sigmas else "",
+            _centimetres(_mean(rows, "point_median_m")),
+            f"{_mean(rows, 'overlap') or 0:.3f}",
+            f"{_centimetres(_mean(rows, 'landmark_median_m'))} "
+            f"({_centimetres(_mean(named, 'landmark_median_m'))})",
         ]
-    return lines
+        lines.append("| " + " | ".join(cells) + " |")
+    return [
+        *lines,
+        "",
+        "Means over the recordings; landmarks in brackets: without items whose ends are alike, of "
+        "which nothing but the hold tells which is called top.",
+    ]
 
 
 def _share(sigmas: Sequence[float], limit: float) -> str:

@@ -100,6 +100,11 @@ def settled(tries):
     return judging.settled([one.verdict for one in tries])
 
 
+def contradicted(best, tries):
+    verdicts = [one.verdict for one in tries]
+    return judging.contradicted(verdicts[tries.index(best)], verdicts)
+
+
 def rival(tries):
     return judging.rival([one.verdict for one in tries])
 
@@ -255,6 +260,46 @@ def test_if_no_way_is_to_be_trusted_the_one_whose_sizes_others_agree_with_is_bes
         0.4,
         0.26,
     )
+
+
+def test_sizes_of_parts_that_only_the_category_joins_need_another_way_that_has_them():
+    """Nothing else tells how far apart they lie."""
+    long = tried(misfit=-0.6, parts=2, size_m=(0.4, 0.5))
+    other = tried(misfit=3.0, size_m=(0.4, 0.4))
+    assert settled([tried(misfit=9.0), long])  # nothing that it may be compared with
+    assert settled([tried(misfit=0.9, category="unknown"), long])
+    assert not settled([other, long]) and not contradicted(other, [other, long])
+    assert contradicted(long, [other, long])
+    assert settled([other, tried(misfit=3.0, size_m=(0.41, 0.51)), long])  # one confirms them
+    assert settled([other, tried(misfit=-0.6, size_m=(0.4, 0.5))])  # of one piece
+    assert not contradicted(long, [long]) and not contradicted(long, [long, long])
+    text = replace(tried(), contradicted=True).untrusted
+    assert "only its category joins its parts" in text and not tried().untrusted
+
+
+def test_ways_of_one_piece_that_agree_outweigh_parts_whose_sizes_they_contradict():
+    long = tried(misfit=-0.6, parts=2, size_m=(0.4, 0.5))
+    whole = [tried(misfit=3.0, size_m=(0.4, 0.4)), tried(misfit=2.0, size_m=(0.405, 0.405))]
+
+    def best(*ways):
+        return judging.best_of([one.verdict for one in ways]).size_m
+
+    assert best(long, *whole) == (0.405, 0.405)
+    assert best(long, whole[0]) == best(long, whole[1]) == (0.4, 0.5)  # nobody agrees with it
+    assert best(long, whole[0], tried(misfit=2.0, size_m=(0.4, 0.42))) == (0.4, 0.5)
+    in_parts = [tried(misfit=2.0, size_m=(0.4, 0.4), parts=2)] * 2
+    assert best(long, *in_parts) == (0.4, 0.5)
+    assert best(long, *whole, tried(misfit=1.0, size_m=(0.41, 0.49))) == (0.4, 0.5)
+
+
+def test_a_way_is_as_sure_as_its_own_category_is_likely():
+    """Parts may be placed as another than the likeliest category has them, and fit it better."""
+    likely = tried(sure=0.9)
+    less = replace(likely, found=SimpleNamespace(**{**vars(likely.found), "category": "skirt"}))
+    assert likely.sure == 0.9 and less.sure == pytest.approx(0.1)
+    assert less.badness == pytest.approx(likely.badness + 0.8, abs=0.01)
+    unknown = SimpleNamespace(**{**vars(likely.found), "category": "unknown"})
+    assert replace(likely, found=unknown).sure == 0.9
 
 
 def test_the_best_way_is_of_the_category_that_most_speaks_for(method, monkeypatch):

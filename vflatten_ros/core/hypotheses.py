@@ -15,7 +15,7 @@ from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.fused import Fused
 from vflatten_ros.core.templates import Template
-from vflatten_ros.core.tried import Tried, Verdict, best_of, rival, settled
+from vflatten_ros.core.tried import Tried, Verdict, best_of, contradicted, rival, settled
 from vflatten_ros.core.values import Progress
 from vflatten_ros.core.ways import Said, Task, Ways
 
@@ -92,7 +92,9 @@ class _Search:
         verdicts = list(counted.values())
         best = best_of(verdicts)
         way = list(counted)[verdicts.index(best)]
-        return replace(self._laid_flat(way), rival=rival(verdicts))
+        return replace(
+            self._laid_flat(way), rival=rival(verdicts), contradicted=contradicted(best, verdicts)
+        )
 
     def _enough(self) -> dict[int, Verdict] | None:
         """The ways that settle it, or all if they do not; None: others have to be tried."""

@@ -189,7 +189,7 @@ def _rotation(
             turns = TURNS + 1  # these were not turned yet
     best = replace(
         best,
-        found=replace(best.found, probabilities=found.probabilities),
+        found=replace(best.found, category=found.category, probabilities=found.probabilities),
         rival="" if best.rival == found.category else best.rival,  # weighed again, it won
     )
     none = np.zeros(0)

@@ -27,6 +27,8 @@ MAJORITY = 2  # ways of the best one's category for each such, for them not to c
 UNDECIDED = 0.9  # probability of the best way's category below which it is unsure
 AGREE = 0.03  # share by which sizes of ways that agree differ
 VOTE = 2.0  # by how many e-folds a way counts less if it is worse by 1
+CONFIRM = 0.05  # share by which sizes may differ of ways that confirm each other
+AGAINST = 5.0  # how much worse a way may be for its sizes to contradict those of one in parts
 NEAR_TIE = 0.67  # share of the best category's votes, for the result not to be trusted
 SURE = 0.97  # probability of a category below which one way alone is not believed
 MOST_UNSEEN = 0.15  # share of the outline that no view shows, above which it is not, either
@@ -70,7 +72,7 @@ class Verdict:
 
     category: str
     badness: float
-    sure: float  # probability of the likeliest category
+    sure: float  # probability of the category, or of the likeliest one if it is "unknown"
     parts: int  # groups that only the category joins, or 1
     unseen: float  # share of the outline that no view shows
     size_m: tuple[float, float] = (0.0, 0.0)  # width and length; 0: none
@@ -84,6 +86,7 @@ class Tried:
     found: Recognition
     aside: float = 0.0  # share of the samples in large groups that were left out
     rival: str = ""  # another category for which other ways speak nearly as much
+    contradicted: bool = False  # see contradicted
     rotation: RotationConfig = RotationConfig()  # by which it was laid flat
 
     @cached_property
@@ -194,9 +197,9 @@ class Tried:
 
     @property
     def sure(self) -> float:
-        """Probability of the likeliest category."""
-        known = [p for name, p in self.found.probabilities.items() if name != UNKNOWN]
-        return max(known, default=0.0)
+        """Probability of its category; of the likeliest, if that is "unknown"."""
+        known = {name: p for name, p in self.found.probabilities.items() if name != UNKNOWN}
+        return known.get(self.found.category, max(known.values(), default=0.0))
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -228,6 +231,8 @@ class Tried:
             return f"it is only {self.sure:.0%} likely to be what it most looks like"
         if self.rival:
             return f"laid flat in other ways it is nearly as good a {self.rival}"
+        if self.contradicted:
+            return "only its category joins its parts, and in other ways it has other sizes"
         return ""
 
 
@@ -250,7 +255,7 @@ def settled(tries: Sequence[Verdict]) -> bool:
         limit = DISPUTED + YIELDING * max(0, len(tries) - 2)
     elif best.parts > 1:
         limit = PLACED + YIELDING * max(0, len(tries) - 2)
-    if best.badness >= limit:
+    if best.badness >= limit or contradicted(best, tries):
         return False
     return len(tries) > 1 or (best.sure >= SURE and best.unseen < MOST_UNSEEN)
 
@@ -278,15 +283,49 @@ def best_of(tries: Sequence[Verdict]) -> Verdict:
     """The best way, to the category with most votes.
 
     If none is to be trusted, the one that others of the category agree with in size: a wrong way
-    is wrong in its own manner, and what lies badly may still have the right size.
+    is wrong in its own manner, and what lies badly may still have the right size. So do ways of one
+    piece count, if they agree, where they contradict one in parts.
     """
     votes = _votes(tries)
     category = max(votes, key=lambda name: votes[name])
     alike = [one for one in tries if one.category == category]
     best = min(alike, key=lambda one: one.badness)
-    if best.badness <= DOUBTFUL or category == UNKNOWN:
+    if category == UNKNOWN:
+        return best
+    if contradicted(best, tries):
+        whole = [one for one in _weighable(best, tries) if one.parts == 1]
+        agreed = [one for one in whole if any(_near(one, o, AGREE) for o in whole if o is not one)]
+        return min(agreed, key=lambda one: one.badness, default=best)
+    if best.badness <= DOUBTFUL:
         return best
     return max(alike, key=lambda one: _agreeing(one, alike))
+
+
+def contradicted(best: Verdict, tries: Sequence[Verdict]) -> bool:
+    """Whether a way's parts are joined by its category alone, and others have other sizes.
+
+    Nothing tells how far apart such parts lie, so one other way has to have the same sizes, if any
+    may be compared.
+    """
+    others = _weighable(best, tries) if best.parts > 1 else []
+    return bool(others) and not any(_near(one, best, CONFIRM) for one in others)
+
+
+def _weighable(best: Verdict, tries: Sequence[Verdict]) -> list[Verdict]:
+    """Other ways to a category whose sizes may be compared with those of its best."""
+    return [
+        one
+        for one in tries
+        if one is not best
+        and one.category == best.category
+        and one.badness < best.badness + AGAINST
+        and 0.0 not in one.size_m
+    ]
+
+
+def _near(one: Verdict, other: Verdict, share: float) -> bool:
+    """Whether both sizes of two ways differ by no more than a share of them."""
+    return bool(np.all(np.abs(np.log(np.divide(one.size_m, other.size_m))) < share))
 
 
 def _agreeing(one: Verdict, alike: Sequence[Verdict]) -> float:

@@ -315,6 +315,28 @@ def test_the_best_way_is_of_the_category_that_most_speaks_for(method, monkeypatc
     assert best.found.category == "skirt" and best.rival == ""
 
 
+def test_parts_whose_sizes_other_ways_contradict_are_not_trusted(method, monkeypatch):
+    long = tried(misfit=-0.2, parts=2, size_m=(0.4, 0.5))
+    three = replace(Config(), rotation=RotationConfig(ways=3))
+    for sizes, wrong in (((0.4, 0.4), True), ((0.4, 0.5), False)):
+        others = [tried(misfit=2.0, size_m=sizes), tried(misfit=2.0, size_m=(0.5, 0.4))]
+        results = iter([*others, long])
+        monkeypatch.setattr(ways._Draw, "tried", lambda *_, left=results: next(left))
+        best = hypotheses.likeliest(0, (), three, lambda *_: None)
+        assert best.found is long.found and best.contradicted == wrong
+
+
+def test_a_category_weighed_again_is_the_one_that_counts():
+    """Trousers whose legs were turned may turn out to be shorts."""
+    one, none = tried(), np.zeros((0, 2))
+    found = Recognition("skirt", {}, {"skirt": 0.6, "towel": 0.4}, one.found.fit, none, none, {})
+    before = replace(one, found=found, rival="towel")
+    after = before.weighed_again(replace(found, category="towel"))
+    assert after.found.category == "towel" and after.found.fit is found.fit
+    assert (before.sure, after.sure) == (0.6, 0.4) and (before.rival, after.rival) == ("towel", "")
+    assert before.weighed_again(found).rival == "towel"
+
+
 def test_the_more_ways_were_tried_the_less_a_dispute_counts():
     placed, hopeless = tried(misfit=-0.3, parts=2), tried(misfit=2.0)
     assert not settled([placed, hopeless]) and settled([placed, hopeless, hopeless])

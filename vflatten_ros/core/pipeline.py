@@ -187,11 +187,7 @@ def _rotation(
         turn += 1
         if not fit.template.parts and found.fits[found.category].template.parts:
             turns = TURNS + 1  # these were not turned yet
-    best = replace(
-        best,
-        found=replace(best.found, category=found.category, probabilities=found.probabilities),
-        rival="" if best.rival == found.category else best.rival,  # weighed again, it won
-    )
+    best = best.weighed_again(found)
     none = np.zeros(0)
     notices = told + unfolded.notices
     if unfolded.points.astray_m is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -88,6 +88,12 @@ class Tried:
     rival: str = ""  # another category for which other ways speak nearly as much
     contradicted: bool = False  # see contradicted
     rotation: RotationConfig = RotationConfig()  # by which it was laid flat
+
+    def weighed_again(self, found: Recognition) -> Tried:
+        """The same with the category that it has once its loose parts were turned."""
+        again = replace(self.found, category=found.category, probabilities=found.probabilities)
+        won = self.rival == found.category
+        return replace(self, found=again, rival="" if won else self.rival)
 
     @cached_property
     def deep_m(self) -> float:

@@ -44,7 +44,7 @@ bench-peers: build/peers/ready  ## Beside other libraries: docs/benchmarks.md (Q
 reproduce: bootstrap  ## The paper's experiments: docs/reproduction.md
 	@$(IN_ENV) python benchmarks/reproduce.py $(ARGS)
 
-accuracy: bootstrap  ## Errors over recordings with known sizes: docs/accuracy.md (RECORDINGS="DIR ...")
+accuracy: bootstrap  ## Errors over recordings with known sizes: docs/accuracy.md (RECORDINGS="NAME=DIR ...")
 	@$(IN_ENV) python benchmarks/accuracy.py $(RECORDINGS) $(ARGS)
 
 cameras: bootstrap  ## The same with other errors of depth, and an item that swings: docs/cameras.md

@@ -119,7 +119,11 @@ def main() -> int:
     runs = args.runs.split(",")
     if not set(runs) <= set(RUNS):
         parser.error(f"--runs: expected some of {','.join(RUNS)}, got {args.runs}")
-    groups = dict(map(group, args.groups))
+    named = [group(text) for text in args.groups]
+    groups = dict(named)
+    if len(groups) < len(named):
+        names = ", ".join(name for name, _ in named)
+        parser.error(f"groups need names of their own, got {names}; give NAME=FOLDER")
     folders = [folder for several in groups.values() for folder in several]
     for name, several in groups.items():
         if not several:
@@ -137,7 +141,7 @@ def main() -> int:
             }
             parts += section(RUNS[run], tables, f"{pictures.parent.name}/{run}")
     with args.output.open("a" if args.append else "w", encoding="utf-8") as page:
-        page.write("\n".join(parts))
+        page.write("\n".join(parts) + "\n")  # a blank line before what is added
     print(args.output)
     return 0
 
@@ -375,7 +379,7 @@ def figures_of_merit(tables: Mapping[str, Sequence[Row]]) -> list[str]:
     """Numbers and means of each group, of all, and of those that the result itself trusts."""
     names = [
         "recordings",
-        "",
+        "number",
         "right",
         "trusted",
         "W, L: mean",

@@ -289,6 +289,8 @@ def test_ways_of_one_piece_that_agree_outweigh_parts_whose_sizes_they_contradict
     assert best(long, whole[0], tried(misfit=2.0, size_m=(0.4, 0.42))) == (0.4, 0.5)
     in_parts = [tried(misfit=2.0, size_m=(0.4, 0.4), parts=2)] * 2
     assert best(long, *in_parts) == (0.4, 0.5)
+    bad = tried(misfit=0.6, parts=2, size_m=(0.4, 0.5))  # none is to be trusted: the vote counts
+    assert best(bad, *[tried(misfit=1.0, size_m=(0.4, 0.4), parts=2)] * 2) == (0.4, 0.4)
     assert best(long, *whole, tried(misfit=1.0, size_m=(0.41, 0.49))) == (0.4, 0.5)
 
 

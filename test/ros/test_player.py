@@ -12,8 +12,8 @@ from ros_rig import RECORDING, Process, recorded, unused_namespace
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, PointCloud2
 
-from vflatten_ros import player
 from vflatten_ros.bag import RecordedCloud, open_recording
+from vflatten_ros.player import Player
 
 
 class Listener:
@@ -92,12 +92,12 @@ class Stopwatch:
 
 @pytest.mark.parametrize("clock", [False, True])
 def test_a_player_keeps_the_recordings_time(ros, monkeypatch, clock):
-    time, published = Stopwatch(), []
-    monkeypatch.setattr(player, "time", time)
-    publisher = SimpleNamespace(publish=lambda message: published.append((time.now_s, message)))
+    watch, published = Stopwatch(), []
+    monkeypatch.setattr("vflatten_ros.player.time", watch)
+    publisher = SimpleNamespace(publish=lambda message: published.append((watch.now_s, message)))
     node = SimpleNamespace(create_publisher=lambda kind, topic, qos: publisher)
     recording = open_recording(RECORDING)
-    player.Player(node, recording, best_effort=False, clock=clock).play(recorded(), 8.0)
+    Player(node, recording, best_effort=False, clock=clock).play(recorded(), 8.0)
     times_s = [now_s for now_s, message in published if not isinstance(message, Clock)]
     expected_s = [7.0 + (m.log_ns - recorded()[0].log_ns) * 1e-9 / 8.0 for m in recorded()]
     assert times_s == pytest.approx(expected_s, abs=1e-9)

@@ -86,7 +86,7 @@ class Tried:
     found: Recognition
     aside: float = 0.0  # share of the samples in large groups that were left out
     rival: str = ""  # another category for which other ways speak nearly as much
-    contradicted: bool = False  # see contradicted
+    contradicted: bool = False  # whether other ways have other sizes than its parts make
     rotation: RotationConfig = RotationConfig()  # by which it was laid flat
 
     def weighed_again(self, found: Recognition) -> Tried:
@@ -289,8 +289,8 @@ def best_of(tries: Sequence[Verdict]) -> Verdict:
     """The best way, to the category with most votes.
 
     If none is to be trusted, the one that others of the category agree with in size: a wrong way
-    is wrong in its own manner, and what lies badly may still have the right size. So do ways of one
-    piece count, if they agree, where they contradict one in parts.
+    is wrong in its own manner, and what lies badly may still have the right size. For the same
+    reason, where ways of one piece agree on other sizes than one in parts, the best of these.
     """
     votes = _votes(tries)
     category = max(votes, key=lambda name: votes[name])
@@ -301,7 +301,8 @@ def best_of(tries: Sequence[Verdict]) -> Verdict:
     if contradicted(best, tries):
         whole = [one for one in _weighable(best, tries) if one.parts == 1]
         agreed = [one for one in whole if any(_near(one, o, AGREE) for o in whole if o is not one)]
-        return min(agreed, key=lambda one: one.badness, default=best)
+        if agreed:
+            return min(agreed, key=lambda one: one.badness)
     if best.badness <= DOUBTFUL:
         return best
     return max(alike, key=lambda one: _agreeing(one, alike))

@@ -26,7 +26,7 @@ from vflatten_ros.core import (
     ways,
 )
 from vflatten_ros.core.config import Config
-from vflatten_ros.core.errors import DisconnectedSurface, InvalidCalibration
+from vflatten_ros.core.errors import DisconnectedSurface, InvalidCalibration, NotEnoughViews
 from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.replay import replay_recording
 from vflatten_ros.results import garment_result, json_text
@@ -377,3 +377,14 @@ def test_an_axis_off_by_centimetres_changes_neither_sizes_nor_where_landmarks_ar
         shown = np.array(list(marks.values())) @ there[:3, :3].T + there[:3, 3]
         off.append(float(np.median(np.linalg.norm(shown - places, axis=1))))
     assert min(off) < 0.015
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [("spacing_m", 0.05, "links"), ("step_m", 1e-5, "links"), ("view_fit_m", 0.002, "plane")],
+)
+def test_settings_that_leave_no_surface_are_refused_in_words(name, value, says):
+    """They are within their ranges."""
+    rotation = dataclasses.replace(ALL_VIEWS.rotation, **{name: value})
+    with pytest.raises((DisconnectedSurface, NotEnoughViews), match=says):
+        replay_recording(BAGS / "SK2_1", dataclasses.replace(ALL_VIEWS, rotation=rotation))

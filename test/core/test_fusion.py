@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.errors import DisconnectedSurface, NotEnoughViews
 from vflatten_ros.core.fusion import Points, fuse
 
 CONFIG = RotationConfig()
@@ -83,3 +85,12 @@ def test_another_draw_has_other_samples_of_the_same_surface():
     away = cKDTree(one.xyz).query(other.xyz[inner(other.xyz)])[0]
     assert np.median(away) > 0.1 * CONFIG.spacing_m
     assert other.xyz[inner(other.xyz), 2].std() < 0.0003
+
+
+@pytest.mark.parametrize(("apart", "error"), [(8, DisconnectedSurface), (10**9, NotEnoughViews)])
+def test_points_too_far_apart_are_refused_in_words(apart, error):
+    xyz, view = cloud(0.0, views=1)
+    some = np.arange(len(xyz))[::apart] if apart < len(xyz) else np.zeros(0, dtype=int)
+    normal = np.tile(UP, (len(some), 1))
+    with pytest.raises(error, match="fusion"):
+        fuse(Points(4 * xyz[some], normal, view[some]), CONFIG)

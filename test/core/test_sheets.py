@@ -101,3 +101,10 @@ def test_links_that_share_too_few_neighbours_go_round_by_round():
         expected &= ~weak
     assert min(rounds) > 0  # each round has something to do
     assert (_supported(a, b, start, n, CONFIG) == expected).all()
+
+
+def test_no_pairs_at_all_are_no_error():
+    xyz = 0.1 * np.arange(6.0)[:, None] * [1.0, 0.0, 0.0]
+    normal = np.tile([0.0, 0.0, 1.0], (6, 1))
+    none = np.zeros(0, dtype=np.int64)
+    assert (sheet_edges(xyz, normal, none, none, CONFIG) >= 0).all()

@@ -99,6 +99,8 @@ def fuse_views(
     Raises
     ------
     NotEnoughViews
+    DisconnectedSurface
+        The points are too far apart to show a surface.
     """
     features = prints is not None and prints.features
     registered = _registered(views, config, progress, prepared or {}, features, so_far)

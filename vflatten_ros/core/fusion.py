@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
+from vflatten_ros.core.errors import DisconnectedSurface, NotEnoughViews
 from vflatten_ros.core.geometry import tangents
 from vflatten_ros.core.parallel import mapped
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
@@ -69,9 +70,23 @@ def fuse(
     progress : Progress
     draw : int
         Added to rotation.draw: another has its grid shifted, and other samples of the surface.
+
+    Raises
+    ------
+    NotEnoughViews
+        There are no points.
+    DisconnectedSurface
+        They are too far apart.
     """
     progress("fuse", 0.0)
+    if not len(points.xyz):
+        raise NotEnoughViews("fusion: got no points; take views that show the item")
     start, direction = _cells(points, config.spacing_m, ((config.draw + draw) * DRAW) % 1.0)
+    if not len(start):
+        raise DisconnectedSurface(
+            f"fusion: of {len(points.xyz)} points no {MIN_CELL} lie within "
+            f"{1e3 * config.spacing_m:.1f} mm; give denser clouds, or raise rotation.spacing_m"
+        )
     firsts = range(0, len(start), CHUNK)
 
     def fitted(first: int) -> tuple[Float, Float, Float, Int, Bool]:

@@ -38,6 +38,7 @@ from vflatten_ros.core.turntable import TURN
 from vflatten_ros.core.values import Int, Progress, View, no_progress
 
 MIN_POINTS = 100  # a view with fewer item points shows nothing that could be placed
+LEAST_PLANES = 20  # points of a view with a plane through their neighbours
 PAIR_POINTS = 300.0  # noise is alike in neighbouring pixels: more pairs than this say no more
 MOST_PARTNERS = 4  # on either side of a view
 FOLD_ROUNDS = 3  # of placing one view by those before it
@@ -89,7 +90,7 @@ def view_surface(
     Raises
     ------
     NotEnoughViews
-        The view has hardly any points on the item.
+        The view has hardly any points on the item, or they are too far apart for planes.
     """
     T_hanger_rig = inverse(view.calibration.T_rig_hanger(view.angle_rad))
     view, needed = thinned(view, config)
@@ -105,6 +106,12 @@ def view_surface(
     smooth, normals, count = _planes(points, suited(config, grain).view_fit_m)
     normals = normals * np.where(((camera - points) * normals).sum(1) < 0, -1.0, 1.0)[:, None]
     row = np.flatnonzero(count >= LEAST)
+    if len(row) < LEAST_PLANES:
+        raise NotEnoughViews(
+            f"view {view.view_id}: {len(row)} of {len(points)} points have {LEAST} others around "
+            f"them to lay a plane through, expected {LEAST_PLANES}: they are "
+            f"{1e3 * grain.pitch_m:.1f} mm apart; give denser clouds, or raise rotation.view_fit_m"
+        )
     smooth = smooth[row]
     return ViewSurface(
         view.view_id,

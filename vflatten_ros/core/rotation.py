@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from vflatten_ros.core.config import RotationConfig
 from vflatten_ros.core.distances import Distances, Steps, link_steps, surface_distances
+from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.faces import evenly_apart
 from vflatten_ros.core.fused import Fused
 from vflatten_ros.core.fusion import Samples
@@ -51,6 +52,7 @@ MOST_DOUBTFUL = 0.1  # of the samples, at a doubt of 1
 TOLD_M = 1e-4  # length of a link between samples that are said to be one point of the cloth
 TOLD_AMONG = 8  # samples nearest to such a point, of which the nearest that faces its way is it
 WITHIN = 0.5  # share of a group's points in the outline, below which it lies apart
+LEAST_LINKS = 1  # along a sheet, for each sample: a square net has two
 RIM_LAID_M = 0.015  # between the two sides of a rim that lies flat as one
 
 
@@ -271,10 +273,23 @@ def parted(
 
 
 def link_surface(fused: Fused, config: RotationConfig, progress: Progress = no_progress) -> Surface:
-    """Link the samples, and find where their sheets end."""
+    """Link the samples, and find where their sheets end.
+
+    Raises
+    ------
+    DisconnectedSurface
+        Hardly any hang together.
+    """
     progress("link", 0.0)
     samples = fused.samples
     links = link_samples(samples.xyz, samples.normal, config)
+    count, joined = len(samples.xyz), int((~links.rim).sum())
+    if joined < LEAST_LINKS * count:
+        raise DisconnectedSurface(
+            f"{count} samples of the surface have {joined} links along it, expected "
+            f"{LEAST_LINKS * count} or more: points too far apart or too noisy to show a surface; "
+            "hold the item nearer to the rig, or see rotation.spacing_m, link_m and step_m"
+        )
     progress("link", 0.7)
     links = links.with_links(*_told(fused, config), TOLD_M)
     edge = _edges(samples, links, fused.sights, config)

@@ -123,7 +123,9 @@ def sheet_edges(xyz: Float, normal: Float, a: Int, b: Int, config: RotationConfi
     ones = np.ones(2 * len(a), dtype=np.float32)
     adjacent = csr_matrix((ones, (np.r_[a, b], np.r_[b, a])), shape=(n, n))
     two = adjacent @ adjacent + adjacent
-    near = np.asarray(two[one, other]).ravel() > 0
+    near = np.zeros(len(one), dtype=bool)
+    if len(one):  # a sparse matrix takes no empty index
+        near = np.asarray(two[one, other]).ravel() > 0
     one, other = one[~near], other[~near]
     chord = xyz[other] - xyz[one]
     hidden = np.zeros(n, dtype=bool)

@@ -186,6 +186,23 @@ def test_markers_show_every_part():
     assert np.ptp(outline, axis=0) == pytest.approx([0.30, 0.50, 0.0], abs=1e-9)
 
 
+def test_both_ends_of_a_pair_are_turned_about_the_axis_that_was_found():
+    axis = np.add(GARMENT.calibration.axis_point, [0.03, 0.0, 0.0])
+    found = replace(GARMENT.calibration, axis_point=tuple(axis))
+    shown = displays.marker_fields(replace(GARMENT, calibration=found), VIEWS)["markers"]
+    newest = max(VIEWS, key=lambda view: (view.stamp_ns, view.view_id))
+    (spheres,) = (marker for marker in shown if marker["ns"] == "correspondences")
+    points = [[p[k] for k in "xyz"] for p in spheres["points"]]
+    pair = GARMENT.correspondences[0]
+    for place, view_id, pixel in zip(
+        points, (pair.view_a, pair.view_b), (pair.pixel_a, pair.pixel_b)
+    ):
+        view = replace(BY_ID[view_id], calibration=found)
+        (hanging,) = view.points_hanger[(view.pixel == np.array(pixel)).all(axis=1)]
+        there = transform_points(found.T_rig_hanger(newest.angle_rad), hanging[None])[0]
+        assert place == pytest.approx(there, abs=1e-6)
+
+
 def test_markers_of_an_empty_garment_are_empty():
     none = replace(
         GARMENT,

@@ -9,6 +9,7 @@ polygon holds plain (u, v, 0) in the frame `garment_flat`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -174,7 +175,8 @@ def _pairs(
     for pair in garment.correspondences:
         for view_id, pixel in ((pair.view_a, pair.pixel_a), (pair.view_b, pair.pixel_b)):
             if view_id in by_id:
-                view = by_id[view_id]
+                # turned about the axis that was found, as everything else of the result is
+                view = replace(by_id[view_id], calibration=garment.calibration)
                 here = (view.pixel == np.array(pixel)).all(axis=1)
                 places.append(view.points_hanger[here][:1])
     points = np.concatenate(places) if places else np.empty((0, 3))

@@ -31,7 +31,8 @@ def test_a_bent_sheet_comes_out_as_its_rectangle():
     assert np.linalg.det(left @ right) > 0  # as the rig sees it, not mirrored
     assert set(done.points.view_id.tolist()) == {3}
     assert len(done.lines.length_m) > 10
-    assert done.notices == ()
+    # its other side, and what hangs behind it, nobody saw
+    assert [notice.code for notice in done.notices] == ["untrusted"]
 
 
 def test_where_it_folds_away_only_what_is_seen_ends():

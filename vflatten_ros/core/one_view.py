@@ -143,10 +143,15 @@ def _lines(
 
 
 def _notices(main: Bool) -> tuple[Notice, ...]:
+    text = (
+        "one view shows one side of the item, and not what hangs behind: category and sizes are of "
+        "what it shows; take two views or a rotation"
+    )
+    notices = (Notice("untrusted", text),)
     share = 1.0 - float(main.mean())
     if share < LEFT_OUT:
-        return ()
+        return notices
     text = (
         f"{100 * share:.0f} % of what the view shows lies beyond jumps or creases and was left out"
     )
-    return (Notice("hidden_crease", text),)
+    return (Notice("hidden_crease", text), *notices)

@@ -73,9 +73,11 @@ def reactivate(rig):
 
 def test_every_reason_to_drop_a_cloud_is_counted_reported_and_explained(rig):
     reactivate(rig)
-    changed = {"joints.wait_s": 0.3, "buffer.max_rate_rad_s": 1.0, "buffer.max_views": 3}
+    changed = {"joints.wait_s": 0.3, "buffer.max_rate_rad_s": 1.0, "buffer.min_views": 3}
+    changed |= {"buffer.max_views": 3}
     before = {"joints.wait_s": 1.0, "buffer.max_rate_rad_s": 0.0, "buffer.max_views": 128}
     for name, value in changed.items():
+    before |= {"buffer.min_views": 6}
         assert rig.set_parameter(name, value).successful
     arm = Turning(rig)
     arm.see(1.0, "no_joint_state")

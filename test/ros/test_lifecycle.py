@@ -150,6 +150,7 @@ def test_parameters_are_described_and_changes_refused_with_a_reason(rig):
 
 
 def test_a_publisher_that_cannot_reach_the_node_is_named_with_the_remedy(rig):
+        ("buffer.max_views", 5, "no rotation would ever be complete"),
     bring(rig, UNCONFIGURED)
     rig.set_parameter("calibration.file", str(CALIBRATION))
     assert rig.set_parameter("joint_states.reliability", "reliable").successful
@@ -305,3 +306,4 @@ def test_a_wrong_start_ends_with_one_line(tmp_path, arguments, code, reason):
     (line,) = [line for line in process.log().splitlines() if "vflatten node: " in line]
     assert reason in line
     assert "Traceback" not in process.log()
+        (["--ros-args", "-p", "buffer.max_views:=5"], 1, "buffer.min_views 6"),

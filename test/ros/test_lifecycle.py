@@ -185,6 +185,22 @@ def test_settings_from_a_file_and_over_it_those_given_by_themselves(ros, tmp_pat
         method, views, calibration = rig.ask("get_parameters", names=names).values
         assert method.string_value == "kita2019"
         assert views.integer_value == 60
+def test_a_topic_of_another_type_is_told_with_the_type(rig):
+    bring(rig, UNCONFIGURED)
+    rig.set_parameter("calibration.file", str(CALIBRATION))
+    assert rig.set_parameter("clouds.topic", "somewhere").successful
+    assert rig.set_parameter("no_data_warning_s", 0.5).successful
+    bring(rig, ACTIVE)
+    rig.until(lambda: f"no cloud on {rig.namespace}/somewhere" in rig.node.log(), "a warning")
+    publisher = rig.planner.create_publisher(JointState, "somewhere", 1)
+    found = f"{rig.namespace}/somewhere is published as sensor_msgs/msg/JointState, expected"
+    rig.until(lambda: found in rig.node.log(), "the type")
+    rig.until(lambda: found in rig.diagnostics()["clouds"][""], "it in diagnostics")
+    rig.planner.destroy_publisher(publisher)
+    bring(rig, INACTIVE)
+    assert rig.set_parameter("clouds.topic", "rig/points").successful
+
+
         assert calibration.string_value == str(CALIBRATION)
     finally:
         rig.close()

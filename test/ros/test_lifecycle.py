@@ -69,6 +69,12 @@ def test_every_transition_in_every_state_gets_an_answer(rig):
 def test_services_answer_in_every_state_and_say_what_is_missing(rig):
     bring(rig, UNCONFIGURED)
     for name in ("list_views", "add_correspondences", "clear_views", "select_views"):
+    for text in (
+        "refused: cleanup (2) is not possible while active; possible: deactivate, shutdown",
+        "inactive: clouds and joint states are no longer taken",
+        "unconfigured: the flattening process has ended",
+    ):
+        assert text in rig.node.log()
         answer = rig.ask(name)
         assert answer.status.code == Status.NOT_ACTIVE
         assert "unconfigured; activate it first" in answer.status.message
@@ -248,6 +254,7 @@ def test_a_finalized_node_still_answers(rig, state, shutdown):
     assert rig.node.stop() == 0
 
 
+    assert "finalized: the node does nothing any more" in rig.node.log()
 def test_who_waits_for_a_result_is_answered_when_the_node_is_taken_down(ros, tmp_path):
     rig = Rig(tmp_path, arguments=["--calibration", str(CALIBRATION)])
     try:

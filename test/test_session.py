@@ -40,6 +40,19 @@ def test_pairs_are_checked_one_by_one(held):
     assert held.add_pairs([fields_of(PAIRS[0])]) == [(0, "the same pair is already there")]
 
 
+def test_a_pair_is_the_same_whichever_side_is_first_and_whoever_gave_it(held):
+    pair = fields_of(PAIRS[0])
+    turned = {
+        f"{name}_{side}": pair[f"{name}_{other}"]
+        for name in ("view", "given", "pixel", "point")
+        for side, other in ("ab", "ba")
+    }
+    again = [pair | {"origin": messages.AUTOMATIC}, pair | {"confidence": 0.25}, pair | turned]
+    answers = held.add_pairs([pair, *again])
+    assert answers == [(1, ""), *[(0, "the same pair is already there")] * 3]
+    assert held.add_pairs(again) == [(0, "the same pair is already there")] * 3
+
+
 def test_pairs_go_with_their_views_and_numbers_are_not_used_twice(held):
     held.add_pairs(map(fields_of, PAIRS))
     assert held.clear_pairs([2, 9]) == (1, [9])

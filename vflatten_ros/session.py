@@ -23,6 +23,7 @@ MAX_PAIRS = 1000  # held, and in one request: each is looked up in its views, 1 
 MAX_IDS = 100_000  # in one request
 
 
+Places = frozenset[tuple[int, tuple[int, int]]]  # view and pixel of both sides
 class Refused(VFlattenError):
     """A request that cannot be done; `code` is one of msg/Status."""
 
@@ -150,17 +151,19 @@ class Session:
 
     def add_pairs(self, pairs: Iterable[Mapping[str, Any]]) -> list[tuple[int, str]]:
         """Check and keep pairs of vflatten_ros/Correspondence fields: id (0: refused), reason."""
-        views = self.views()
-        return [self._add_pair(pair, views) for pair in pairs]
+        views, held = self.views(), set(map(_places, self.pairs.values()))
+        return [self._add_pair(pair, views, held) for pair in pairs]
 
-    def _add_pair(self, fields: Mapping[str, Any], views: Mapping[int, View]) -> tuple[int, str]:
+    def _add_pair(
+        self, fields: Mapping[str, Any], views: Mapping[int, View], held: set[Places]
+    ) -> tuple[int, str]:
         if len(self.pairs) >= MAX_PAIRS:
             return 0, f"there are {MAX_PAIRS} pairs already; clear some"
         try:
             pair = messages.correspondence_from_fields(fields, views)
         except InvalidCorrespondence as error:
             return 0, str(error)
-        if pair in self.pairs.values():
+        if _places(pair) in held:
             return 0, "the same pair is already there"
         self.pairs[self._next_pair] = pair
         self._next_pair += 1
@@ -193,6 +196,7 @@ class Session:
         pairs = [self.pairs[i] for i in sorted(self.pairs)]
         pairs = [pair for pair in pairs if {pair.view_a, pair.view_b} <= kept]
         item = self.buffer.state().item
+        held.add(_places(pair))
         return Task(tuple(held[i] for i in chosen), tuple(pairs), config, item)
 
 
@@ -205,3 +209,8 @@ def _check_count(ids: Sequence[int]) -> None:
 
 def _listed(ids: Iterable[int]) -> str:
     return ", ".join(map(str, sorted(ids))) or "none"
+def _places(pair: Correspondence) -> Places:
+    """What a pair joins, whichever side is named first and whoever gave it."""
+    return frozenset({(pair.view_a, pair.pixel_a), (pair.view_b, pair.pixel_b)})
+
+

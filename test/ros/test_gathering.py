@@ -129,6 +129,65 @@ def test_every_reason_to_drop_a_cloud_is_counted_reported_and_explained(rig):
 
 
 def test_an_item_that_fills_the_image_is_told_as_it_arrives(rig):
+def test_a_wrist_that_does_not_turn_is_told_in_the_log_and_in_the_diagnostics(rig):
+    reactivate(rig)
+    arm = Turning(rig)
+    arm.turn(1.0)
+    for number in range(12):
+        arm.turn(0.5)
+        arm.see(arm.now_s - 0.2, "duplicate_angle" if number else None)
+    text = "wrist joint 'wrist_roll' has moved by 0.000 rad while {} clouds came; does the joint"
+    assert rig.node.log().count(text.format(11)) == 1
+    assert text.format(12) in rig.diagnostics()["buffer"][""]
+    reactivate(rig)
+
+
+def test_joint_states_without_a_position_are_told(rig):
+    reactivate(rig)
+    rig.publish(JointState(name=["finger_left", "wrist_roll"], position=[0.0]))
+    rig.publish(JointState(name=["wrist_roll"], position=[np.nan]))
+    said = "states of joint 'wrist_roll' came without a usable position, the newest has"
+    rig.until(lambda: said in rig.node.log(), "a warning")
+    shown = rig.until(
+        lambda: (
+            (now := rig.diagnostics()["buffer"])["joint states without a position"] == "2" and now
+        ),
+        "both",
+    )
+    assert f"2 {said} position nan" in shown[""]
+    reactivate(rig)
+
+
+def test_most_of_the_last_clouds_dropped_is_told_though_there_are_views(rig):
+    reactivate(rig)
+    arm = Turning(rig)
+    arm.turn(4.0, rate=0.5)
+    for at_s in (1.5, 2.0, 2.5):
+        arm.see(at_s)
+    arm.see(3.0, "wrong_frame", frame="map")
+    assert "of the last" not in rig.diagnostics()["buffer"][""]
+    for at_s in (3.1, 3.2, 3.3):
+        arm.see(at_s, "wrong_frame", frame="map")
+    text = "4 of the last 7 clouds dropped, most as wrong_frame: correct the frame"
+    assert text in rig.diagnostics()["buffer"][""]
+    reactivate(rig)
+
+
+def test_each_way_in_which_a_cloud_is_wrong_is_told(rig):
+    reactivate(rig)
+    arm = Turning(rig)
+    for lies in ({"fields": []}, {"point_step": 2}, {"data": b""}):
+        arm.see(1.0, "invalid_cloud", **lies)
+    arm.see(1.0, "empty_after_segmentation", data=np.zeros(60 * 30 * 3, "<f4").tobytes())
+    arm.see(1.0, "empty_after_segmentation", data=np.full(60 * 30 * 3, 1300, "<f4").tobytes())
+    lines = rig.node.log().splitlines()
+    kinds = {line.split("invalid_cloud: ")[1] for line in lines if "invalid_cloud: " in line}
+    assert len(kinds) >= 3, kinds
+    assert any("none of its 60 x 30 points is measured" in line for line in lines)
+    assert any("are these millimetres?" in line for line in lines)
+    reactivate(rig)
+
+
     reactivate(rig)
     arm = Turning(rig)
     arm.turn(2.0, rate=0.5)

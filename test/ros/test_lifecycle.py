@@ -8,6 +8,7 @@ import rclpy
 import slow_work
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import ParameterType
+from rclpy.parameter import Parameter
 from ros_rig import CALIBRATION, REAL, ROOT, Process, Rig
 from sensor_msgs.msg import JointState
 from vflatten_ros.msg import Status
@@ -61,20 +62,24 @@ def test_every_transition_in_every_state_gets_an_answer(rig):
                 assert not change(rig, transition), (state, transition)
                 assert rig.lifecycle_state() == state
         assert not change(rig, 0, "no such transition")
+    item = rig.buffer().item
+    assert change(rig, 0, "deactivate")
+    assert change(rig, ACTIVATE)
+    assert rig.buffer().item == item + 1  # numbers are not used twice
     assert change(rig, 0, "deactivate")
     assert change(rig, 0, "cleanup")
     assert rig.lifecycle_state() == UNCONFIGURED
-
-
-def test_services_answer_in_every_state_and_say_what_is_missing(rig):
-    bring(rig, UNCONFIGURED)
-    for name in ("list_views", "add_correspondences", "clear_views", "select_views"):
     for text in (
         "refused: cleanup (2) is not possible while active; possible: deactivate, shutdown",
         "inactive: clouds and joint states are no longer taken",
         "unconfigured: the flattening process has ended",
     ):
         assert text in rig.node.log()
+
+
+def test_services_answer_in_every_state_and_say_what_is_missing(rig):
+    bring(rig, UNCONFIGURED)
+    for name in ("list_views", "add_correspondences", "clear_views", "select_views"):
         answer = rig.ask(name)
         assert answer.status.code == Status.NOT_ACTIVE
         assert "unconfigured; activate it first" in answer.status.message
@@ -145,6 +150,7 @@ def test_parameters_are_described_and_changes_refused_with_a_reason(rig):
         ("method", "magic", "one of rotation, kita2019"),
         ("clouds.topic", "elsewhere", "deactivate it first"),
         ("buffer.max_views", -5, "range"),
+        ("buffer.max_views", 5, "no rotation would ever be complete"),
         ("segmentation.radius_m", float("nan"), ""),
     ):
         answer = rig.set_parameter(name, value)
@@ -156,7 +162,6 @@ def test_parameters_are_described_and_changes_refused_with_a_reason(rig):
 
 
 def test_a_publisher_that_cannot_reach_the_node_is_named_with_the_remedy(rig):
-        ("buffer.max_views", 5, "no rotation would ever be complete"),
     bring(rig, UNCONFIGURED)
     rig.set_parameter("calibration.file", str(CALIBRATION))
     assert rig.set_parameter("joint_states.reliability", "reliable").successful
@@ -180,17 +185,6 @@ def test_a_publisher_that_cannot_reach_the_node_is_named_with_the_remedy(rig):
         rig.planner.destroy_publisher(publisher)
 
 
-def test_settings_from_a_file_and_over_it_those_given_by_themselves(ros, tmp_path):
-    values = "{method: kita2019, buffer.max_views: 50, calibration.file: elsewhere.yaml}"
-    file = tmp_path / "settings.yaml"
-    file.write_text("/**: {ros__parameters: " + values + "}\n")
-    arguments = ["--params-file", str(file), "--calibration", str(CALIBRATION)]
-    rig = Rig(tmp_path, arguments=[*arguments, "--ros-args", "-p", "buffer.max_views:=60"])
-    try:
-        names = ["method", "buffer.max_views", "calibration.file"]
-        method, views, calibration = rig.ask("get_parameters", names=names).values
-        assert method.string_value == "kita2019"
-        assert views.integer_value == 60
 def test_a_topic_of_another_type_is_told_with_the_type(rig):
     bring(rig, UNCONFIGURED)
     rig.set_parameter("calibration.file", str(CALIBRATION))
@@ -207,6 +201,17 @@ def test_a_topic_of_another_type_is_told_with_the_type(rig):
     assert rig.set_parameter("clouds.topic", "rig/points").successful
 
 
+def test_settings_from_a_file_and_over_it_those_given_by_themselves(ros, tmp_path):
+    values = "{method: kita2019, buffer.max_views: 50, calibration.file: elsewhere.yaml}"
+    file = tmp_path / "settings.yaml"
+    file.write_text("/**: {ros__parameters: " + values + "}\n")
+    arguments = ["--params-file", str(file), "--calibration", str(CALIBRATION)]
+    rig = Rig(tmp_path, arguments=[*arguments, "--ros-args", "-p", "buffer.max_views:=60"])
+    try:
+        names = ["method", "buffer.max_views", "calibration.file"]
+        method, views, calibration = rig.ask("get_parameters", names=names).values
+        assert method.string_value == "kita2019"
+        assert views.integer_value == 60
         assert calibration.string_value == str(CALIBRATION)
     finally:
         rig.close()
@@ -249,12 +254,12 @@ def test_a_finalized_node_still_answers(rig, state, shutdown):
     for transition in ALL:
         assert not change(rig, transition)
     assert rig.lifecycle_state() == FINALIZED
+    assert "finalized: the node does nothing any more" in rig.node.log()
     assert not rig.node.children()  # the flattening process is gone
     assert rig.ask("new_item").message.startswith("the node is finalized")
     assert rig.node.stop() == 0
 
 
-    assert "finalized: the node does nothing any more" in rig.node.log()
 def test_who_waits_for_a_result_is_answered_when_the_node_is_taken_down(ros, tmp_path):
     rig = Rig(tmp_path, arguments=["--calibration", str(CALIBRATION)])
     try:
@@ -315,11 +320,41 @@ def test_a_mistake_of_ours_in_a_transition_leads_back_to_unconfigured(ros):
         node.destroy_node()
 
 
+def test_settings_of_the_flattening_process_count_until_the_activation(ros, tmp_path):
+    given = []
+
+    def loader(options):
+        given.append((options.categories, options.worker_processes))
+        return slow_work.load
+
+    node = FlattenNode("changed", loader=loader)
+    try:
+        node.set_parameters([Parameter("calibration.file", value=str(CALIBRATION))])
+        node.trigger_configure()
+        categories = str(ROOT / "config" / "categories")
+        for name, value in (("categories", categories), ("worker_processes", 1)):
+            (answer,) = node.set_parameters([Parameter(name, value=value)])
+            assert answer.successful
+        node.trigger_activate()
+        assert given == [("", 2), (categories, 1)]
+        node.trigger_deactivate()
+        node.trigger_activate()
+        assert len(given) == 2  # nothing has changed
+        node.trigger_deactivate()
+        node.set_parameters([Parameter("categories", value=str(tmp_path / "nowhere"))])
+        node.trigger_activate()
+        assert node.lifecycle_state()[0] == INACTIVE
+        assert "nowhere" in node.trouble
+    finally:
+        node.destroy_node()
+
+
 @pytest.mark.parametrize(
     "arguments, code, reason",
     [
         (["--ros-args", "-p", "geodesics.nodes:=1"], 1, "geodesics.nodes"),
         (["--ros-args", "-p", "method:=5"], 1, "method"),
+        (["--ros-args", "-p", "buffer.max_views:=5"], 1, "buffer.min_views 6"),
         (["--nonsense"], 2, "--nonsense"),
     ],
 )
@@ -329,4 +364,3 @@ def test_a_wrong_start_ends_with_one_line(tmp_path, arguments, code, reason):
     (line,) = [line for line in process.log().splitlines() if "vflatten node: " in line]
     assert reason in line
     assert "Traceback" not in process.log()
-        (["--ros-args", "-p", "buffer.max_views:=5"], 1, "buffer.min_views 6"),

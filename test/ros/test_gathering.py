@@ -1,6 +1,7 @@
 """What becomes of every cloud: each reason to drop one, as a planner and an operator see it."""
 
 import runpy
+import signal
 import types
 
 import numpy as np
@@ -76,8 +77,8 @@ def test_every_reason_to_drop_a_cloud_is_counted_reported_and_explained(rig):
     changed = {"joints.wait_s": 0.3, "buffer.max_rate_rad_s": 1.0, "buffer.min_views": 3}
     changed |= {"buffer.max_views": 3}
     before = {"joints.wait_s": 1.0, "buffer.max_rate_rad_s": 0.0, "buffer.max_views": 128}
-    for name, value in changed.items():
     before |= {"buffer.min_views": 6}
+    for name, value in changed.items():
         assert rig.set_parameter(name, value).successful
     arm = Turning(rig)
     arm.see(1.0, "no_joint_state")
@@ -128,7 +129,6 @@ def test_every_reason_to_drop_a_cloud_is_counted_reported_and_explained(rig):
     rig.serves_a_good_rotation()
 
 
-def test_an_item_that_fills_the_image_is_told_as_it_arrives(rig):
 def test_a_wrist_that_does_not_turn_is_told_in_the_log_and_in_the_diagnostics(rig):
     reactivate(rig)
     arm = Turning(rig)
@@ -188,6 +188,7 @@ def test_each_way_in_which_a_cloud_is_wrong_is_told(rig):
     reactivate(rig)
 
 
+def test_an_item_that_fills_the_image_is_told_as_it_arrives(rig):
     reactivate(rig)
     arm = Turning(rig)
     arm.turn(2.0, rate=0.5)
@@ -284,6 +285,31 @@ def test_the_planner_gathers_again_where_its_views_are_gone():
     with pytest.raises(example.NoViews):  # nobody turns it once more
         gather_and_flatten(turned_it_itself, object(), {"views": []}, "rotation")
     assert turned_it_itself.gathered == 1
+
+
+def test_a_planner_without_a_recording_says_so_at_once(ros, tmp_path):
+    planner = Process(["examples/planner.py", str(tmp_path / "nowhere")], tmp_path / "log")
+    assert planner.wait() == 1
+    (line,) = planner.log().splitlines()
+    assert line.startswith("planner: ") and "nowhere: no such recording" in line
+
+
+def test_a_recording_that_cannot_be_played_is_no_lack_of_views(ros, rig, tmp_path):
+    arguments = ["examples/planner.py", str(tmp_path), "--node", f"{rig.namespace}/vflatten"]
+    planner = Process(arguments, tmp_path / "log")
+    assert planner.wait() == 1
+    assert "the recording was not played (exit code 1)" in planner.log()
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_a_planner_that_is_interrupted_ends_without_a_traceback(rig, tmp_path, how):
+    arguments = ["examples/planner.py", str(CALIBRATION.parent), "--rate", "1"]
+    arguments += ["--node", f"{rig.namespace}/vflatten", "--namespace", rig.namespace]
+    planner = Process(arguments, tmp_path / "log")
+    rig.until(lambda: "views: " in planner.log(), "the first view")
+    assert planner.stop(how) == 130
+    assert "Traceback" not in planner.log()
+    rig.serves_a_good_rotation()
 
 
 def test_planners_as_processes_at_once_each_get_a_result(rig, tmp_path):

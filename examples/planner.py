@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -22,6 +23,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from vflatten_ros.action import Flatten
 from vflatten_ros.msg import Correspondence, Status, ViewBufferState
@@ -70,7 +72,10 @@ class Planner(Node):
 
     def wait(self, future: Any, limit_s: float) -> Any:
         """The result of a future; raises TimeoutError."""
-        rclpy.spin_until_future_complete(self, future, timeout_sec=limit_s)
+        end = time.monotonic() + limit_s
+        while not future.done() and (left_s := end - time.monotonic()) > 0.0:
+            # a little at a time: Ctrl-C is seen between two waits
+            rclpy.spin_until_future_complete(self, future, timeout_sec=min(left_s, 0.2))
         if not future.done():
             raise TimeoutError(f"no answer within {limit_s:g} s")
         return future.result()
@@ -94,6 +99,8 @@ class Planner(Node):
         """Until the rotation is over: the item has stopped turning, or enough views are there."""
         while player is not None and player.poll() is None:
             rclpy.spin_once(self, timeout_sec=0.1)
+        if player is not None and player.returncode:
+            raise RuntimeError(f"the recording was not played (exit code {player.returncode})")
         end = time.monotonic() + 10.0
         while time.monotonic() < end:
             self.views = self.state().buffer
@@ -160,6 +167,10 @@ def report(planner: Planner, result: Any) -> None:
     seen = [mark for mark in estimate.landmarks if mark.seen]
     for mark in sorted(seen, key=lambda m: -m.certainty)[:1]:
         place = planner.call("locate_landmark", LocateLandmark.Request(name=mark.name))
+        if place.status.code == Status.NO_JOINT_STATE:  # the recording is over: it hangs as it did
+            angle = result.flattened.view_angles[-1]
+            request = LocateLandmark.Request(name=mark.name, at_angle=True, item_angle=angle)
+            place = planner.call("locate_landmark", request)
         if place.status.code == Status.OK:
             p = place.position.point
             print(f"  next grasp: {mark.name} at {p.x:.3f} {p.y:.3f} {p.z:.3f} m (rig frame)")
@@ -185,11 +196,16 @@ def main() -> int:
     options.add_argument("--save", type=Path, metavar="DIR", help="write the result's messages")
     args = options.parse_args()
 
+    if not args.recording.exists():
+        print(f"planner: {args.recording}: no such recording; try bags/LS1_1", file=sys.stderr)
+        return 1
     protocol_file = args.recording / "protocol.json"
     by_hand = protocol_file.is_file() and args.method in ("", "kita2019")
     protocol = json.loads(protocol_file.read_text()) if by_hand else {"views": []}
 
-    rclpy.init()
+    # rclpy's own handlers shut the context down from another thread, in the middle of a call
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     planner = Planner(args.node)
     player = None
     try:
@@ -208,6 +224,8 @@ def main() -> int:
     except (TimeoutError, RuntimeError) as error:
         print(f"planner: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        return 130
     finally:
         if player is not None:
             player.terminate()

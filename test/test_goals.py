@@ -120,11 +120,14 @@ def test_views_are_prepared_as_they_come_before_a_task_asks(office):
 
 
 def test_equal_tasks_are_done_once_and_answered_alike(office):
+    office.goals.take_finished()
     first, second = office.ask(slow_work.SLOW), office.ask(slow_work.SLOW)
     assert office.goals.waiting == 0
     assert office.answer(first) is office.answer(second)
+    assert [finished.again for finished in office.goals.take_finished()] == [False]
     third = office.ask(slow_work.SLOW)
     assert third.outcomes[0] is first.outcomes[0]
+    assert [finished.again for finished in office.goals.take_finished()] == [True]
 
 
 def test_different_tasks_wait_for_one_another_and_the_queue_is_bounded(office):
@@ -139,7 +142,8 @@ def test_different_tasks_wait_for_one_another_and_the_queue_is_bounded(office):
 
 
 def test_errors_of_the_method_are_told_and_the_next_task_goes_on(office):
-    assert office.answer(office.ask(slow_work.WRONG)).error == "three views are needed"
+    few = office.answer(office.ask(slow_work.WRONG))
+    assert (few.error, few.few_views) == ("three views are needed", True)
     mistake = office.answer(office.ask(slow_work.MISTAKE))
     assert "internal error" in mistake.error and "ZeroDivisionError" in mistake.error
     assert office.answer(office.ask(slow_work.GOOD)).garment
@@ -182,14 +186,19 @@ def test_a_process_that_dies_costs_one_task(office, how):
     if how == "killed":
         office.until(lambda: asker.steps)
         os.kill(office.worker.pid, signal.SIGKILL)
+    office.goals.take_finished()
     assert "ended" in office.answer(asker).error
+    (failed,) = office.goals.take_finished()  # it counts as any other that failed
+    assert failed.outcome is asker.outcomes[0] and not failed.outcome.cancelled
     assert office.answer(office.ask(slow_work.GOOD)).garment
 
 
 def test_a_process_that_cannot_start_answers_and_is_not_started_at_once_again():
     office = Office(slow_work.load_and_fail)
     try:
-        assert "while it started" in office.answer(office.ask(slow_work.GOOD)).error
+        outcome = office.answer(office.ask(slow_work.GOOD))
+        assert "while it started" in outcome.error and not outcome.cancelled
+        assert [finished.outcome for finished in office.goals.take_finished()] == [outcome]
         assert office.goals.restarts == 0
     finally:
         office.goals.stop()

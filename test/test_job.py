@@ -38,12 +38,12 @@ def calls(monkeypatch):
     monkeypatch.setattr(pipeline, "prepare_view", prepare_view)
     monkeypatch.setattr(registration, "fold_in", fold_in)
     monkeypatch.setattr(pipeline, "flatten_garment", flatten_garment)
-    monkeypatch.setattr(job, "serialized", lambda garment, views: {})
+    monkeypatch.setattr(job, "serialized", lambda garment, views, item: {})
     return noted
 
 
 def flatten(work, views, config):
-    task = SimpleNamespace(correspondences=(), config=config)
+    task = SimpleNamespace(correspondences=(), config=config, item=1)
     work.flatten(views, task, lambda stage, fraction: None)
 
 

@@ -284,3 +284,9 @@ def test_read_is_the_reverse_of_fill(fake):
 def test_fill_refuses_an_unknown_field(fake):
     with pytest.raises(KeyError, match="colour"):
         messages.fill(fake(), {"colour": 1})
+
+
+def test_a_result_says_whose_item_it_is():
+    for fields_of in (messages.flattened_view_fields, messages.garment_estimate_fields):
+        assert fields_of(GARMENT, VIEWS)["item"] == 0  # of no node
+        assert fields_of(GARMENT, VIEWS, 7)["item"] == 7

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vflatten_ros.node_log import MOST_CAUSES, REPEAT_S, Log
+from vflatten_ros.node_log import MOST_CAUSES, MOST_OF_KIND, REPEAT_S, Log, without_numbers
 
 
 class Logger:
@@ -50,3 +50,21 @@ def test_causes_are_not_remembered_without_bound(log):
             log.info("again", cause=str(number))
     assert len(log._last) == MOST_CAUSES >= len(log._held)
     assert len(log._logger.lines) == 3 * MOST_CAUSES
+
+
+def test_different_causes_of_one_kind_are_each_logged_but_a_few_at_a_time(log, time):
+    for _ in range(2):
+        for cause in ("no fields", "rows too short"):
+            log.warning(cause, cause, kind="invalid_cloud")
+    assert [line for _, line in log._logger.lines] == ["no fields", "rows too short"]
+    for number in range(100):
+        log.warning(f"frame {number}", f"frame {number}", kind="wrong_frame")
+    assert len(log._logger.lines) == 2 + MOST_OF_KIND + 1  # the rest shares one
+    time[0] += REPEAT_S
+    log.warning("frame 200", "frame 200", kind="wrong_frame")
+    assert log._logger.lines[-1] == ("warning", "frame 200")
+
+
+def test_lines_that_differ_in_numbers_only_have_one_cause():
+    one, other = "stamped 0.250 s before view 3", "stamped 1e-06 s before view 17"
+    assert without_numbers(one) == without_numbers(other) == "stamped # s before view #"

@@ -41,6 +41,7 @@ def test_changes_give_new_settings_and_leave_the_old():
         ({"geodesics.nodes": 2}, "expected 3 to 500"),
         ({"clouds.reliability": "sometimes"}, "one of best_effort, reliable"),
         ({"max_queued_goals": True}, "expected int"),
+        ({"calibration.joint_sign": 0.5}, r"expected \+1 or -1, got 0.5"),
         ({"method": "magic"}, "one of rotation, kita2019"),
     ],
 )

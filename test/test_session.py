@@ -40,6 +40,19 @@ def test_pairs_are_checked_one_by_one(held):
     assert held.add_pairs([fields_of(PAIRS[0])]) == [(0, "the same pair is already there")]
 
 
+def test_a_pair_is_the_same_whichever_side_is_first_and_whoever_gave_it(held):
+    pair = fields_of(PAIRS[0])
+    turned = {
+        f"{name}_{side}": pair[f"{name}_{other}"]
+        for name in ("view", "given", "pixel", "point")
+        for side, other in ("ab", "ba")
+    }
+    again = [pair | {"origin": messages.AUTOMATIC}, pair | {"confidence": 0.25}, pair | turned]
+    answers = held.add_pairs([pair, *again])
+    assert answers == [(1, ""), *[(0, "the same pair is already there")] * 3]
+    assert held.add_pairs(again) == [(0, "the same pair is already there")] * 3
+
+
 def test_pairs_go_with_their_views_and_numbers_are_not_used_twice(held):
     held.add_pairs(map(fields_of, PAIRS))
     assert held.clear_pairs([2, 9]) == (1, [9])
@@ -65,7 +78,21 @@ def test_the_wrist_is_where_the_last_credible_joint_state_has_it(held):
     for position in (0.5, float("nan"), float("inf"), 1e300):
         held.add_joint(0, (joint, "other"), (position, 1.0), 0)
     held.add_joint(0, ("other",), (2.0,), 0)
-    assert held.wrist_rad == 0.5
+    assert held.wrist.position_rad == 0.5
+
+
+def test_where_the_wrist_is_has_a_stamp_and_is_not_known_for_ever(held):
+    with pytest.raises(Refused, match="no state of joint") as error:
+        held.item_angle(0, 5.0)
+    assert error.value.code == session.NO_JOINT_STATE
+    came_ns = 1_000_000_000
+    held.add_joint(7, (held.calibration.joint,), (0.5,), came_ns)  # stamps of another clock
+    expected = held.calibration.item_angle_rad(0.5)
+    assert held.item_angle(came_ns + 5 * 10**9, 5.0) == (expected, 7)
+    held.add_joint(8, (held.calibration.joint,), (float("nan"),), came_ns + 5 * 10**9)
+    with pytest.raises(Refused, match=r"came 6\.0 s ago, no_data_warning_s allows 5 s") as error:
+        held.item_angle(came_ns + 6 * 10**9, 5.0)
+    assert error.value.code == session.NO_JOINT_STATE
 
 
 def test_pairs_are_bounded(held, monkeypatch):
@@ -123,7 +150,7 @@ def test_a_task_holds_the_views_in_the_order_asked_for_and_their_pairs(held):
     assert [view.view_id for view in task.views] == [5, 2]
     assert task.correspondences == PAIRS
     assert task.config.method == "kita2019"
-    assert held.task(Config(), "", [2]).correspondences == ()
+    assert held.task(Config(), "kita2019", [2]).correspondences == ()
 
 
 @pytest.mark.parametrize(
@@ -138,6 +165,12 @@ def test_a_task_that_cannot_be_is_refused_with_its_code(held, method, ids, code)
     with pytest.raises(Refused) as error:
         held.task(Config(), method, ids)
     assert error.value.code == code
+
+
+def test_one_view_is_too_few_for_a_rotation(held):
+    with pytest.raises(Refused, match="needs two views or more, got 1; turn the item") as error:
+        held.task(Config(), "rotation", [2])
+    assert error.value.code == session.NO_VIEWS
 
 
 def test_a_task_without_views_is_refused():

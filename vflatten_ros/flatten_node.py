@@ -27,14 +27,16 @@ from vflatten_ros.core.events import (
     RotationComplete,
     ViewAdded,
     ViewReplaced,
+    WristStill,
 )
 from vflatten_ros.core.image_border import cut_off_now
 from vflatten_ros.core.values import Calibration, FlatGarment
 from vflatten_ros.files import load_calibration
 from vflatten_ros.frames import Frames
-from vflatten_ros.goals import Goals, Listener, Task
+from vflatten_ros.goals import Finished, Goals, Listener
 from vflatten_ros.node_inputs import Inputs
 from vflatten_ros.node_lifecycle import ACTIVE, INACTIVE, SUCCESS, AnsweringLifecycleNode
+from vflatten_ros.node_log import without_numbers
 from vflatten_ros.node_outputs import (
     ERROR,
     OK,
@@ -43,11 +45,13 @@ from vflatten_ros.node_outputs import (
     buffer_message,
     buffer_status,
     flattening_status,
+    joint_fault_text,
+    still_text,
 )
 from vflatten_ros.node_services import Services, summary
 from vflatten_ros.parameters import CalibrationOptions, NodeOptions, Parameters, Settings
 from vflatten_ros.session import NOT_ACTIVE, Refused, Session
-from vflatten_ros.worker import Load, Outcome, Worker
+from vflatten_ros.worker import Load, Worker
 
 TICK_S = 0.05
 DIAGNOSTICS_S = 1.0
@@ -78,13 +82,18 @@ class FlattenNode(AnsweringLifecycleNode):
         self._loader = loader or _loader
         self.session: Session | None = None
         self.goals: Goals | None = None
-        self.last_garment: FlatGarment | None = None
+        self.last_garment: FlatGarment | None = None  # of the present item
+        self._item = 0  # the newest item's number: it goes on after a deactivation
+        self._views_come = 0  # of that item
+        self._joint_faults = 0  # told so far
+        self._ends = False
         self.frames = Frames(self)
         self._waits_for_tf = False  # to activate by itself
         self.errors = 0  # of our own, caught by the main loop
         self._finished = self._failed = 0
         self._failing = False
         self._last = ""
+        self._refused, self._last_refusal = 0, ""
         self._alone_at = time.monotonic()
         self._declared = Parameters(
             self, lambda: self.lifecycle_state()[0] == ACTIVE, self._on_settings
@@ -111,6 +120,8 @@ class FlattenNode(AnsweringLifecycleNode):
 
     def active_session(self) -> Session:
         """The session; raises Refused while the node is not active."""
+        if self._ends:
+            raise Refused(NOT_ACTIVE, "the node is being ended; start it again")
         number, label = self.lifecycle_state()
         if number != ACTIVE or self.session is None:
             raise Refused(NOT_ACTIVE, f"the node is {label}; activate it first{self._why()}")
@@ -154,26 +165,57 @@ class FlattenNode(AnsweringLifecycleNode):
         """Check the categories and start the flattening process."""
         options = self.settings.node.node
         load_templates(options.categories or None)
+        if self.goals is not None:
+            self.goals.stop()
         worker = Worker(self._loader(options), self._worker_guard.trigger, options.worker_nice)
         self.goals = Goals(worker, lambda: self.settings.node.node.max_queued_goals)
+        self._started_with = _of_process(options)
 
     def activate(self) -> None:
         """Read the calibration, begin an empty buffer and subscribe."""
         calibration = self._calibration(self.settings.node.calibration)
-        self.session = Session(calibration, self.settings.core)
-        self.last_garment = None
+        if _of_process(self.settings.node.node) != self._started_with:
+            self.configure()  # they may change until now
+        self.session = Session(calibration, self.settings.core, self._item)
+        self._begin_item(self.session.buffer.state().item)
+        self._joint_faults = 0
         self._sensors.open(self.settings.node.clouds, self.settings.node.joint_states)
         self.buffer_changed()
         self.log.info(
-            f"active: clouds in {calibration.frame} turned by {calibration.joint}, method "
-            f"{self.settings.core.method}"
+            f"active: item {self._item} begins, clouds in {calibration.frame} turned by "
+            f"{calibration.joint}, method {self.settings.core.method}"
         )
 
     def deactivate(self) -> None:
         """Unsubscribe and cancel what is being flattened."""
         self._sensors.close()
+        self._abandon("the node was deactivated before this was done")
+
+    def _abandon(self, reason: str) -> None:
+        """Cancel what is being flattened, and answer who waits for it."""
+        if self._requests.waiting:
+            text = f"{self._requests.waiting} requests for a result are abandoned: {reason}"
+            self.log.warning(text)
         if self.goals is not None:
-            self.goals.cancel_all("the node was deactivated")
+            self.goals.cancel_all(reason)
+
+    def end(self, cause: str) -> bool:
+        """The node is about to be taken down; whether somebody is still to be answered."""
+        self.log.info(f"the node ends: {cause}")
+        self._ends = True
+        self._sensors.close()
+        waiting = self.answering
+        self._abandon(f"the node was ended ({cause}) before this was done")
+        return waiting
+
+    @property
+    def answering(self) -> bool:
+        """Whether an answer to a request for a result has not left yet."""
+        return self._requests.waiting > 0
+
+    def take_joint_states(self) -> None:
+        """Take every joint state that has come."""
+        self._sensors.take_joint_states()
 
     def cleanup(self) -> None:
         """End the flattening process."""
@@ -234,9 +276,10 @@ class FlattenNode(AnsweringLifecycleNode):
 
     def _note(self, event: Event) -> None:
         if isinstance(event, ItemStarted):
-            self.last_garment = None
             # a clock that goes to and fro, as with two publishers, begins item after item
-            cause = event.cause if event.cause == CLOCK_SET_BACK else ""
+            few = self.session is None or self._views_come < self.session.buffer.min_views
+            cause = event.cause if few and event.cause == CLOCK_SET_BACK else ""
+            self._begin_item(event.item)
             self.log.info(f"item {event.item} begins: {event.cause}", cause)
         elif isinstance(event, RotationComplete):
             self.log.info(f"rotation complete: {event.views} views")
@@ -245,9 +288,18 @@ class FlattenNode(AnsweringLifecycleNode):
             text = f"stamps went back by {back:.3f} s: the views of before are forgotten"
             self.log.warning(text, cause="clock")
         elif isinstance(event, CloudDropped) and event.reason not in ("duplicate_angle", "cleared"):
-            self.log.warning(self._drop_line(event), cause=event.reason)
+            # each text once: one reason has many causes
+            cause = without_numbers(event.text)
+            self.log.warning(self._drop_line(event), cause, kind=event.reason)
+        elif isinstance(event, WristStill) and self.session is not None:
+            self.log.warning(still_text(self.session.calibration.joint, event))
         elif isinstance(event, ViewAdded | ViewReplaced):
+            self._views_come += 1
             self._look_at_border(event.view_id)
+
+    def _begin_item(self, item: int) -> None:
+        self._item, self._views_come = item, 0
+        self.last_garment = None
 
     def _look_at_border(self, view_id: int) -> None:
         """Warn while the item turns, not only with the result."""
@@ -291,7 +343,7 @@ class FlattenNode(AnsweringLifecycleNode):
             task = self.active_session().task(self.settings.core)
         except Refused:
             return
-        self.goals.submit(task, Listener(lambda stage, fraction: None, self._log_failure))
+        self.goals.submit(task, Listener(lambda stage, fraction: None, lambda outcome: None))
 
     def _look_early(self) -> None:
         """Flatten what there is so far, if nothing else is being flattened."""
@@ -302,37 +354,56 @@ class FlattenNode(AnsweringLifecycleNode):
             self.session.looked()
             self._submit_own()
 
-    def _log_failure(self, outcome: Outcome) -> None:
-        if outcome.garment is None and not outcome.cancelled:
-            self.log.warning(f"flattening by itself failed: {outcome.error}", cause="flatten")
+    def note_refusal(self, error: Refused) -> None:
+        """A request for a result that is not even begun leaves a line, too."""
+        self._refused += 1
+        self._last_refusal = _first_line(str(error))
+        text = f"a goal was refused: {error}"
+        self.log.warning(text, without_numbers(self._last_refusal), kind="refused")
 
     def _on_worker(self) -> None:
         if self.goals is None:
             return
         for line in self.goals.handle_events():
             self.log.error(line, cause="process")
-        for task, outcome in self.goals.take_finished():
-            self._on_outcome(task, outcome)
+        self._take_finished()
 
-    def _on_outcome(self, task: Task, outcome: Outcome) -> None:
+    def _take_finished(self) -> None:
+        for finished in self.goals.take_finished() if self.goals is not None else ():
+            self._on_outcome(finished)
+
+    def _on_outcome(self, finished: Finished) -> None:
+        item, outcome = finished.task.item, finished.outcome
         if outcome.garment is None:
             self._failing = not outcome.cancelled
             self._failed += self._failing
-            self._last = "cancelled" if outcome.cancelled else outcome.error.splitlines()[0]
+            self._last = "cancelled" if outcome.cancelled else _first_line(outcome.error)
+            if self._failing:
+                text = f"item {item} not flattened: {outcome.error}"
+                self.log.warning(text, without_numbers(self._last), kind="failed")
             return
-        self._failing = False
-        self._finished += 1
-        self._last = summary(outcome.garment)
-        if self.session is not None and task.item == self.session.buffer.state().item:
-            self.last_garment = outcome.garment
-            if outcome.garment.enough and not self.session.enough:
-                self.session.enough = True
-                count = len(outcome.garment.view_ids)
-                self.log.info(f"item {task.item}: {count} views are enough")
-                self.buffer_changed()
-        self._results.publish_result(outcome.messages, self.settings.node.outputs)
-        total = sum(outcome.seconds.values())
-        self.log.info(f"item {task.item} flattened in {total:.2f} s: {self._last}")
+        if not finished.again:
+            self._failing = False
+            self._finished += 1
+            self._last = summary(outcome.garment)
+            total = sum(outcome.seconds.values())
+            self.log.info(f"item {item} flattened in {total:.2f} s: {self._last}")
+        if item == self._item:
+            self._on_garment(outcome.garment)
+            self._results.publish_result(outcome.messages, self.settings.node.outputs)
+        elif not finished.again:
+            self.log.info(
+                f"the result of item {item} goes to those who asked for it only, and is not "
+                f"published: item {self._item} has begun"
+            )
+
+    def _on_garment(self, garment: FlatGarment) -> None:
+        """A result of the present item."""
+        self.last_garment = garment
+        if self.session is not None and garment.enough and not self.session.enough:
+            self.session.enough = True
+            self.log.info(f"item {self._item}: {len(garment.view_ids)} views are enough")
+            self.buffer_changed()
 
     # ---- timers
 
@@ -343,12 +414,24 @@ class FlattenNode(AnsweringLifecycleNode):
         if self.goals is not None:
             for line in self.goals.check_deadlines():
                 self.log.warning(line, cause="stubborn")
+            self._take_finished()
 
     def _on_diagnostics(self) -> None:
         self._activate_with_tf()
         self._look_for_namesakes()
         self._sensors.check_quiet(self.settings.node.node.no_data_warning_s)
+        self._look_at_joint_states()
         self._results.publish_diagnostics(self._statuses())
+
+    def _look_at_joint_states(self) -> None:
+        """Joint states without a position come as fast as others: a line once in a while."""
+        if self.session is None:
+            return
+        state = self.session.buffer.state()
+        if state.joint_faults > self._joint_faults:
+            self._joint_faults = state.joint_faults
+            text = joint_fault_text(self.session.calibration.joint, state)
+            self.log.warning(f"{self._sensors.topic('joint_states')}: {text}", cause="positions")
 
     def _look_for_namesakes(self) -> None:
         """Two nodes of one name answer one another's calls, now this one, now that."""
@@ -369,7 +452,15 @@ class FlattenNode(AnsweringLifecycleNode):
         if self.session is not None:
             statuses.append(buffer_status(self.session))
         statuses.append(
-            flattening_status(self.goals, self._finished, self._failed, self._failing, self._last)
+            flattening_status(
+                self.goals,
+                self._finished,
+                self._failed,
+                self._failing,
+                self._last,
+                self._refused,
+                self._last_refusal,
+            )
         )
         return statuses
 
@@ -379,6 +470,15 @@ class FlattenNode(AnsweringLifecycleNode):
             self.goals.stop()
         self._requests.destroy()
         super().destroy_node()
+
+
+def _first_line(text: str) -> str:
+    return (text.splitlines() or [""])[0][:300]
+
+
+def _of_process(options: NodeOptions) -> tuple[str, int, int]:
+    """Settings that the flattening process is started with."""
+    return options.categories, options.worker_processes, options.worker_nice
 
 
 def _loader(options: NodeOptions) -> Load:

@@ -36,6 +36,15 @@ class Task:
     item: int = 0  # which item the views are of
 
 
+@dataclass(frozen=True)
+class Finished:
+    """A task that ended."""
+
+    task: Task
+    outcome: Outcome
+    again: bool = False  # it had ended before; somebody asked for it once more
+
+
 class _Scale:
     """0-1 of a whole flattening, from how long each stage took the last time."""
 
@@ -84,7 +93,7 @@ class Goals:
         self._now: _Run | None = None
         self._waiting: list[_Run] = []
         self._last: tuple[Task, Outcome] | None = None
-        self._finished: list[tuple[Task, Outcome]] = []
+        self._finished: list[Finished] = []
         self.stage, self.fraction = "", 0.0
         self._progress = 0.0
         self._scale = _Scale()
@@ -110,6 +119,8 @@ class Goals:
     def submit(self, task: Task, listener: Listener) -> bool:
         """Ask for a task; False if the queue is full."""
         if self._last is not None and self._last[0] == task:
+            # published once more: outputs may have been switched on meanwhile
+            self._finished.append(Finished(*self._last, again=True))
             listener.on_done(self._last[1])
             return True
         for run in [self._now, *self._waiting]:
@@ -163,7 +174,7 @@ class Goals:
                 lines.append(self._died(event))
         return lines
 
-    def take_finished(self) -> list[tuple[Task, Outcome]]:
+    def take_finished(self) -> list[Finished]:
         """Tasks that ended since the last call, each once however many waited for it."""
         finished, self._finished = self._finished, []
         return finished
@@ -191,8 +202,9 @@ class Goals:
         if self._now is None and self._waiting and self.ready:
             run = self._now = self._waiting.pop(0)
             self.stage, self.fraction, self._progress = "start", 0.0, 0.0
+            task = run.task
             self._worker.submit(
-                run.number, run.task.views, run.task.correspondences, run.task.config
+                run.number, task.views, task.correspondences, task.config, task.item
             )
 
     def _step(self, step: Step) -> None:
@@ -208,7 +220,7 @@ class Goals:
         if run is None or outcome.number != run.number:
             return
         self._now = None
-        self._finished.append((run.task, outcome))
+        self._finished.append(Finished(run.task, outcome))
         if outcome.garment is not None:
             self._scale.learn(run.task.config.method, outcome.seconds)
             self._last = (run.task, outcome)
@@ -229,7 +241,9 @@ class Goals:
         if self.ready:
             self._restart(f"{text}; see the log, and try again")
             return f"{text}; started anew"
-        self.cancel_all(f"{text} while it started; see the log")
+        waiting, self._waiting = self._waiting, []
+        for run in waiting:
+            self._fail(run, f"{text} while it started; see the log")
         self._start_at = time.monotonic() + START_PAUSE_S
         return f"{text} while it started; next try in {START_PAUSE_S:g} s"
 
@@ -239,5 +253,12 @@ class Goals:
         self._start_at = None
         self.restarts += 1
         self._worker.restart()
-        for listener in run.listeners if run else []:
-            listener.on_done(Outcome(run.number if run else 0, error=reason))
+        if run is not None:
+            self._fail(run, reason)
+
+    def _fail(self, run: _Run, reason: str) -> None:
+        cancelled = run.cancelled_at is not None
+        outcome = Outcome(run.number, error=reason, cancelled=cancelled)
+        self._finished.append(Finished(run.task, outcome))
+        for listener in run.listeners:
+            listener.on_done(outcome)

@@ -89,7 +89,7 @@ class Flattening:
             self._helper,
         )
         progress("messages", 0.0)
-        return garment, serialized(garment, views)
+        return garment, serialized(garment, views, job.item)
 
     def _is_prepared(self, view: View, config: Config) -> bool:
         return view in self._prepared and self._prepared[view].settings == _settings(config)
@@ -118,7 +118,7 @@ def _prepared(view: View, config: Config) -> _Prepared:
     return _Prepared(_settings(config), surface)
 
 
-def serialized(garment: FlatGarment, views: Sequence[View]) -> dict[str, bytes]:
+def serialized(garment: FlatGarment, views: Sequence[View], item: int = 0) -> dict[str, bytes]:
     """Every message of a result, serialized: filling them would hold up the node's callbacks."""
     from rclpy.serialization import serialize_message
 
@@ -126,5 +126,5 @@ def serialized(garment: FlatGarment, views: Sequence[View]) -> dict[str, bytes]:
         message.topic.rpartition("/")[2]: bytes(
             serialize_message(fill(message_class(message.type)(), message.fields))
         )
-        for message in result_messages(garment, views)
+        for message in result_messages(garment, views, item)
     }

@@ -77,11 +77,17 @@ def angles_of(garment: FlatGarment, views: Iterable[View]) -> Float:
     return np.array([known.get(i, np.nan) for i in garment.view_ids], dtype=np.float64)
 
 
-def flattened_view_fields(garment: FlatGarment, views: Sequence[View]) -> Fields:
+def is_trusted(garment: FlatGarment) -> bool:
+    """Whether a result may be used for sizes."""
+    return all(notice.code != "untrusted" for notice in garment.notices)
+
+
+def flattened_view_fields(garment: FlatGarment, views: Sequence[View], item: int = 0) -> Fields:
     """vflatten_ros/FlattenedView of a garment that was flattened from `views`."""
     points, outline = garment.points, garment.outline
     return {
         "header": header_fields(garment.stamp_ns, frame_of(views)),
+        "item": int(item),
         "method": garment.method,
         "view_ids": np.array(garment.view_ids, dtype=np.uint32),
         "view_angles": angles_of(garment, views),
@@ -108,13 +114,14 @@ def flattened_view_fields(garment: FlatGarment, views: Sequence[View]) -> Fields
     }
 
 
-def garment_estimate_fields(garment: FlatGarment, views: Sequence[View]) -> Fields:
+def garment_estimate_fields(garment: FlatGarment, views: Sequence[View], item: int = 0) -> Fields:
     """vflatten_ros/GarmentEstimate of a garment that was flattened from `views`."""
     ranked = sorted(garment.scores.items(), key=lambda item: (-item[1], item[0]))
     first = {"width": 0, "length": 1}
     sizes = sorted(garment.measurements, key=lambda m: first.get(m.name, 2))
     return {
         "header": header_fields(garment.stamp_ns, frame_of(views)),
+        "item": int(item),
         "category": garment.category,
         "hypotheses": [{"category": name, "score": f32(score)} for name, score in ranked],
         "score_kind": PROBABILITY if garment.score_kind == "probability" else R_SCORE,
@@ -125,7 +132,7 @@ def garment_estimate_fields(garment: FlatGarment, views: Sequence[View]) -> Fiel
         "enough": bool(garment.enough),
         "unseen": _unseen_kind(garment),
         "turn_to": _turn_to(garment),
-        "trusted": all(notice.code != "untrusted" for notice in garment.notices),
+        "trusted": is_trusted(garment),
         **_notice_fields(garment),
     }
 

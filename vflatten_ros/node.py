@@ -11,8 +11,10 @@ import argparse
 import json
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -25,6 +27,8 @@ from vflatten_ros.parameters import NodeOptions
 from vflatten_ros.worker import Load
 
 MAX_ERRORS = 1000  # in a row
+ANSWERS_S = 1.0  # longest that the last answers may take to be written
+LEAVE_S = 0.2  # and then to leave
 
 
 class EndAsked:
@@ -37,19 +41,21 @@ class EndAsked:
     """
 
     def __init__(self) -> None:
+        self.name = "the context was shut down"
         self._came = False
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._note)
 
-    def _note(self, *_: object) -> None:
+    def _note(self, number: int, _: object) -> None:
+        self.name = signal.Signals(number).name
         self._came = True
 
     def __call__(self) -> bool:
         return self._came
 
 
-def spin(node: FlattenNode, end_asked: Callable[[], bool]) -> None:
-    """Serve until the end is asked for or the context is shut down.
+def spin(node: FlattenNode, end_asked: EndAsked) -> None:
+    """Serve until the end is asked for or the context is shut down; then answer who waits.
 
     A mistake of ours costs one callback, not the node.
     """
@@ -71,6 +77,19 @@ def spin(node: FlattenNode, end_asked: Callable[[], bool]) -> None:
             node.log.warning(text, cause="spin")
             if in_a_row == MAX_ERRORS:  # nothing works any more: better to be started anew
                 raise
+    if node.end(end_asked.name) and rclpy.ok():
+        _let_answers_leave(node, executor)
+
+
+def _let_answers_leave(node: FlattenNode, executor: SingleThreadedExecutor) -> None:
+    """Who waits for a result has been told that none will come; that must be sent, too."""
+    with suppress(Exception):  # it ends anyway
+        end = time.monotonic() + ANSWERS_S
+        while node.answering and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.02)
+        end = time.monotonic() + LEAVE_S
+        while time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.02)
 
 
 def main(

@@ -17,6 +17,7 @@ from vflatten_ros.node_outputs import OK, WARN, Status
 from vflatten_ros.parameters import CloudInput, JointInput
 
 MAX_PUBLISHERS = 4
+TYPES = {"clouds": "sensor_msgs/msg/PointCloud2", "joint_states": "sensor_msgs/msg/JointState"}
 
 
 class Numbers:
@@ -110,10 +111,15 @@ class Inputs:
         for name, subscription in self._subscriptions.items():
             traffic = self.traffic[name]
             silence = time.monotonic() - traffic.last_s
-            if silence > limit_s and not traffic.quiet:
-                traffic.quiet = True
+            if silence <= limit_s:
+                continue
+            if wrong := self._wrong_type(name, subscription.topic_name):
+                # once a minute: such a publisher may come after the first warning
+                self._log.warning(wrong, cause=f"type of {name}")
+            elif not traffic.quiet:
                 line = self._quiet_line(name, subscription.topic_name, silence)
-                self._log.warning(line, cause=f"no {name}")
+                self._log.warning(line, cause=f"no {name} on {subscription.topic_name}")
+            traffic.quiet = True
 
     def statuses(self, limit_s: float) -> list[Status]:
         """Diagnostics of each topic."""
@@ -134,11 +140,24 @@ class Inputs:
             "seconds since the last": f"{silence:.1f}",
         }
         part = name.replace("_", " ")
+        if silence > limit_s and (wrong := self._wrong_type(name, topic)):
+            return WARN, part, wrong, values
         if traffic.incompatible and silence > limit_s:
             return WARN, part, f"a publisher's QoS does not match ({traffic.incompatible})", values
         if silence > limit_s:
             return WARN, part, f"nothing for {silence:.0f} s, {publishers} publishers", values
         return OK, part, "receiving" if traffic.received else "waiting", values
+
+    def _wrong_type(self, name: str, topic: str) -> str:
+        """That publishers of a topic send something else, and nobody what is expected; else ""."""
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        types = sorted({publisher.topic_type for publisher in publishers})
+        if not types or TYPES[name] in types:
+            return ""
+        return (
+            f"{topic} is published as {', '.join(types)}, expected {TYPES[name]}; "
+            f"set {name}.topic, or remap"
+        )
 
     def _quiet_line(self, name: str, topic: str, silence: float) -> str:
         what = "cloud" if name == "clouds" else "joint state"

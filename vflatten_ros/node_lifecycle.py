@@ -13,6 +13,10 @@ from vflatten_ros.core.errors import VFlattenError
 from vflatten_ros.node_log import Log
 
 INACTIVE, ACTIVE = 2, 3  # lifecycle_msgs/State.PRIMARY_STATE_...
+TRANSITIONS = {0: "create", 1: "configure", 2: "cleanup", 3: "activate", 4: "deactivate"} | {
+    **dict.fromkeys((5, 6, 7), "shutdown"),
+    8: "destroy",
+}  # lifecycle_msgs/Transition
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -51,21 +55,26 @@ class AnsweringLifecycleNode(LifecycleNode):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Unsubscribe and cancel what is being flattened."""
-        return self._transition("deactivate", self.deactivate)
+        done = "inactive: clouds and joint states are no longer taken"
+        return self._transition("deactivate", self.deactivate, done)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """End the flattening process."""
-        return self._transition("clean up", self.cleanup)
+        done = "unconfigured: the flattening process has ended"
+        return self._transition("clean up", self.cleanup, done)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """As deactivate and cleanup."""
-        return self._transition("shut down", self._shut_down)
+        done = "finalized: the node does nothing any more; end it"
+        return self._transition("shut down", self._shut_down, done)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """After a mistake of our own: everything down, so that configure can try again."""
         return self._transition("recover", self._shut_down)
 
-    def _transition(self, name: str, change: Callable[[], None]) -> TransitionCallbackReturn:
+    def _transition(
+        self, name: str, change: Callable[[], None], done: str = ""
+    ) -> TransitionCallbackReturn:
         try:
             change()
         except VFlattenError as error:
@@ -77,6 +86,8 @@ class AnsweringLifecycleNode(LifecycleNode):
             self.log.error(f"internal error in {name}:\n{traceback.format_exc()}")
             return TransitionCallbackReturn.ERROR
         self.trouble = ""
+        if done:
+            self.log.info(done)
         return SUCCESS
 
     def _shut_down(self) -> None:
@@ -89,7 +100,9 @@ class AnsweringLifecycleNode(LifecycleNode):
         if any(label == name if label else number == known for known, name in possible):
             return change(request, response)
         state = self.lifecycle_state()[1]
-        text = f"refused: {label[:60] or f'transition {number}'} is not possible while {state}"
+        asked = label[:60] or f"{TRANSITIONS.get(number, 'transition')} ({number})"
+        others = ", ".join(dict.fromkeys(name for _, name in possible)) or "none"
+        text = f"refused: {asked} is not possible while {state}; possible: {others}"
         self.log.warning(text, cause=f"transition {number} while {state}")
         response.success = False
         return response

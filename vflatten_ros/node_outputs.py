@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from vflatten_ros import displays, messages
+from vflatten_ros.core.events import REMEDIES, BufferState, WristStill
 from vflatten_ros.goals import Goals
 from vflatten_ros.messages import message_class
 from vflatten_ros.msg import ViewBufferState
@@ -24,6 +26,7 @@ LATCHED = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 RESULTS = {name: message_class(kind) for name, kind in TYPES.items()}
+FEWEST_CLOUDS = 4  # that a share of them says something
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 Status = tuple[int, str, str, Mapping[str, Any]]  # level, part, message, values
 
@@ -95,16 +98,56 @@ def buffer_status(session: Session) -> Status:
         "clouds received": state.clouds_received,
         "clouds waiting": state.clouds_waiting,
         "clock jumps": state.clock_jumps,
+        "joint states without a position": state.joint_faults,
         **{f"dropped: {reason}": count for reason, count in state.drops.items()},
     }
     lost = sum(state.drops.values())
     text = f"{state.stage.name.lower()}, {len(state.view_ids)} views, {lost} clouds dropped"
     only_drops = lost > 0 and not state.view_ids
-    return (WARN if only_drops else OK), "buffer", text, values
+    troubles = _troubles(state, session.calibration.joint)
+    level = WARN if only_drops or troubles else OK
+    return level, "buffer", "; ".join([text, *troubles]), values
+
+
+def still_text(joint: str, still: WristStill) -> str:
+    """That the wrist does not turn, and what to look at."""
+    return (
+        f"wrist joint {joint!r} has moved by {still.moved_rad:.3f} rad while {still.clouds} clouds "
+        "came; does the joint in the calibration turn, does the robot rotate?"
+    )
+
+
+def joint_fault_text(joint: str, state: BufferState) -> str:
+    """That joint states give no position."""
+    return (
+        f"{state.joint_faults} states of joint {joint!r} came without a usable position, the "
+        f"newest has {state.joint_fault or 'one again'}; check what publishes them"
+    )
+
+
+def _troubles(state: BufferState, joint: str) -> list[str]:
+    """What an operator should look at; reasons without a remedy are part of every rotation."""
+    troubles = [] if state.still is None else [still_text(joint, state.still)]
+    if state.joint_fault:
+        troubles.append(joint_fault_text(joint, state))
+    reasons = Counter(reason for reason in state.recent if reason in REMEDIES)
+    if len(state.recent) >= FEWEST_CLOUDS and 2 * reasons.total() > len(state.recent):
+        most = reasons.most_common(1)[0][0]
+        troubles.append(
+            f"{reasons.total()} of the last {len(state.recent)} clouds dropped, most as {most}: "
+            f"{REMEDIES[most]}"
+        )
+    return troubles
 
 
 def flattening_status(
-    goals: Goals | None, finished: int, failed: int, failing: bool, last: str
+    goals: Goals | None,
+    finished: int,
+    failed: int,
+    failing: bool,
+    last: str,
+    refused: int,
+    last_refusal: str,
 ) -> Status:
     """Diagnostics of the flattening process."""
     if goals is None:
@@ -115,11 +158,13 @@ def flattening_status(
         "waiting": goals.waiting,
         "process restarts": goals.restarts,
         "last": last,
+        "refused": refused,
+        "last refusal": last_refusal,
     }
     if not goals.ready:
         return WARN, "flattening", "the process is starting", values
     if goals.busy:
         return OK, "flattening", f"{goals.stage} {goals.fraction:.0%}", values
     if failing:
-        return WARN, "flattening", "the last one failed", values
+        return WARN, "flattening", f"the last one failed: {last}", values
     return OK, "flattening", "idle", values

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import PointStamped
@@ -28,11 +29,13 @@ from vflatten_ros.session import (
     INVALID_ARGUMENT,
     MAX_PAIRS,
     NO_RESULT,
+    NO_VIEWS,
+    NOT_HELD,
     NOT_SEEN,
     OK,
     PARTLY,
+    UNKNOWN_ID,
     UNKNOWN_NAME,
-    UNKNOWN_VIEW,
     Refused,
     Session,
 )
@@ -54,12 +57,21 @@ if TYPE_CHECKING:
 RESULT_KEPT_S = 60  # for a client that asks late; rclpy's 15 minutes would pile results up
 
 
+class Waiting(NamedTuple):
+    """A request for a result, and what it waits for."""
+
+    listener: Listener
+    outcome: Future
+    item: int
+
+
 class Services:
     """All of the node's services. A request that cannot be done raises Refused in here."""
 
     def __init__(self, node: FlattenNode) -> None:
         self._node = node
-        self._waiting: dict[bytes, tuple[Listener, Future]] = {}
+        self._waiting: dict[bytes, Waiting] = {}
+        self.waiting = 0  # requests for a result that have no answer yet
         for kind, name, callback in (
             (GetState, "state", self._get_state),
             (ListViews, "list_views", self._list_views),
@@ -143,7 +155,7 @@ class Services:
             return
         response.removed, unknown, events = session.clear_views(list(request.ids))
         self._node.take_events(events)
-        _report_unknown(response.status, "view", unknown, response.removed, UNKNOWN_VIEW)
+        _report_unknown(response.status, "view", unknown, response.removed)
 
     def _new_item(self) -> str:
         events: tuple[Event, ...] = self._session().new_item("requested")
@@ -181,7 +193,7 @@ class Services:
 
     def _clear_pairs(self, request: Any, response: Any) -> None:
         response.removed, unknown = self._session().clear_pairs(list(request.ids))
-        _report_unknown(response.status, "pair", unknown, response.removed, INVALID_ARGUMENT)
+        _report_unknown(response.status, "pair", unknown, response.removed)
         self._node.buffer_changed()
 
     def _clear_all_pairs(self) -> str:
@@ -193,11 +205,21 @@ class Services:
 
     def _locate(self, request: Any, response: Any) -> None:
         session = self._session()
+        self._node.take_joint_states()  # the fingers may have opened, too
         garment = self._node.last_garment
         if garment is None:
-            raise Refused(NO_RESULT, "nothing has been flattened yet; send a Flatten goal first")
+            item = session.buffer.state().item
+            text = f"nothing of item {item} has been flattened yet; send a Flatten goal first"
+            raise Refused(NO_RESULT, text)
+        if session.buffer.fingers_open:
+            raise Refused(
+                NOT_HELD,
+                "the fingers are open: the item of the last result hangs there no longer; "
+                "grasp an item, turn it and flatten",
+            )
         mark = _landmark(garment, request.name)
-        angle = _angle(session, request)
+        limit_s = self._node.settings.node.node.no_data_warning_s
+        angle, stamp_ns = _angle(session, request, limit_s)
         unseen = f"no view shows {mark.name!r}; turn the item and flatten again"
         if mark.xyz_hanger is None:
             raise Refused(NOT_SEEN, unseen)
@@ -207,12 +229,13 @@ class Services:
             xyz = transform_points(self._node.frames.matrix(request.frame_id, frame), xyz)
             frame = request.frame_id
         fields = {
-            "header": messages.header_fields(self._node.get_clock().now().nanoseconds, frame),
+            "header": messages.header_fields(stamp_ns, frame),
             "point": messages.point_fields(xyz),
         }
         response.position = messages.fill(PointStamped(), fields)
         response.sigma = float(mark.xyz_sigma_m)
         response.certainty = float(mark.certainty)
+        response.trusted = messages.is_trusted(garment)
         response.views = list(mark.views)
         if not mark.seen:
             raise Refused(NOT_SEEN, f"{unseen}; the position is the nearest cloth that one shows")
@@ -221,11 +244,11 @@ class Services:
 
     async def _trigger_flatten(self, _: Any, response: Any) -> Any:
         try:
-            _, future = self._submit("", [], lambda stage, fraction: None)
+            waiting = self._submit("", [], lambda stage, fraction: None)
         except Refused as error:
             response.message = str(error)
             return response
-        outcome = await future
+        outcome = await self._outcome(waiting)
         response.success = outcome.garment is not None
         response.message = (
             summary(outcome.garment) if outcome.garment is not None else outcome.error
@@ -234,16 +257,33 @@ class Services:
 
     def _submit(
         self, method: str, ids: list[int], on_progress: Callable[[str, float], None]
-    ) -> tuple[Listener, Future]:
+    ) -> Waiting:
         """Ask for a flattening; the future gives its Outcome. Raises Refused."""
+        try:
+            return self._submitted(method, ids, on_progress)
+        except Refused as error:
+            self._node.note_refusal(error)
+            raise
+
+    def _submitted(
+        self, method: str, ids: list[int], on_progress: Callable[[str, float], None]
+    ) -> Waiting:
         node = self._node
         task = self._session().task(node.settings.core, method, ids)
         future = Future()
         listener = Listener(on_progress, future.set_result)
         if node.goals is None or not node.goals.submit(task, listener):
-            waiting = node.settings.node.node.max_queued_goals
-            raise Refused(BUSY, f"{waiting} goals are waiting already; try again later")
-        return listener, future
+            most = node.settings.node.node.max_queued_goals
+            raise Refused(BUSY, f"{most} goals are waiting already; try again later")
+        return Waiting(listener, future, task.item)
+
+    async def _outcome(self, waiting: Waiting) -> Outcome:
+        self.waiting += 1
+        try:
+            outcome: Outcome = await waiting.outcome
+        finally:
+            self.waiting -= 1
+        return outcome
 
     async def _execute(self, goal: Any) -> Any:
         key = bytes(goal.goal_id.uuid)
@@ -259,13 +299,15 @@ class Services:
             self._on_cancel(goal)
         self._feedback(goal, "waiting", 0.0)
         try:
-            outcome = await waiting[1]
+            outcome = await self._outcome(waiting)
         finally:
             del self._waiting[key]
         if goal.is_cancel_requested:
             goal.canceled()
-            return Flatten.Result(status=Status(code=CANCELLED, message="cancelled on request"))
+            status = Status(code=CANCELLED, message="cancelled on request")
+            return Flatten.Result(status=status, item=waiting.item)
         result = _result(outcome)
+        result.item = waiting.item
         goal.succeed() if outcome.garment is not None else goal.abort()
         return result
 
@@ -277,10 +319,11 @@ class Services:
     def _on_cancel(self, goal: Any) -> CancelResponse:
         """Answer at once; the worker stops by itself, or is ended after a grace period."""
         waiting = self._waiting.get(bytes(goal.goal_id.uuid))
-        if waiting is not None and not waiting[1].done():
+        if waiting is not None and not waiting.outcome.done():
             if self._node.goals is not None:
-                self._node.goals.withdraw(waiting[0])
-            waiting[1].set_result(Outcome(0, error="cancelled on request", cancelled=True))
+                self._node.goals.withdraw(waiting.listener)
+            self._node.log.info(f"a goal of item {waiting.item} was cancelled by its caller")
+            waiting.outcome.set_result(Outcome(0, error="cancelled on request", cancelled=True))
         return CancelResponse.ACCEPT
 
 
@@ -298,7 +341,8 @@ def summary(garment: FlatGarment) -> str:
 def _result(outcome: Outcome) -> Any:
     result = Flatten.Result()
     if outcome.garment is None:
-        code = CANCELLED if outcome.cancelled else FAILED
+        failed = NO_VIEWS if outcome.few_views else FAILED
+        code = CANCELLED if outcome.cancelled else failed
         result.status = Status(code=code, message=outcome.error)
         return result
     result.status = Status(code=OK, message=summary(outcome.garment))
@@ -319,23 +363,17 @@ def _landmark(garment: FlatGarment, name: str) -> Landmark:
     )
 
 
-def _angle(session: Session, request: Any) -> float:
+def _angle(session: Session, request: Any, limit_s: float) -> tuple[float, int]:
+    """Item angle asked for, and the stamp of the joint state that has it, 0 if it is given."""
     if request.at_angle:
         angle = float(request.item_angle)
         if not np.isfinite(angle) or abs(angle) > 1e6:
             raise Refused(INVALID_ARGUMENT, f"item_angle: expected an angle in rad, got {angle}")
-        return angle
-    if session.wrist_rad is None:
-        raise Refused(
-            INVALID_ARGUMENT,
-            f"no state of joint {session.calibration.joint!r} has come; give item_angle",
-        )
-    return session.calibration.item_angle_rad(session.wrist_rad)
+        return angle, 0
+    return session.item_angle(time.monotonic_ns(), limit_s)
 
 
-def _report_unknown(
-    status: Any, what: str, unknown: list[int], removed: int, none_code: int
-) -> None:
+def _report_unknown(status: Any, what: str, unknown: list[int], removed: int) -> None:
     if unknown:
-        status.code = PARTLY if removed else none_code
+        status.code = PARTLY if removed else UNKNOWN_ID
         status.message = f"{what} {unknown[0]} does not exist ({len(unknown)} unknown ids)"

@@ -29,11 +29,11 @@ class Message(NamedTuple):
     fields: Fields
 
 
-def result_messages(garment: FlatGarment, views: Sequence[View]) -> list[Message]:
-    """What the node would publish, on the node's topics."""
+def result_messages(garment: FlatGarment, views: Sequence[View], item: int = 0) -> list[Message]:
+    """What the node would publish, on the node's topics; `item` 0: not of a node."""
     fields: dict[str, Fields] = {
-        "flattened_view": messages.flattened_view_fields(garment, views),
-        "garment": messages.garment_estimate_fields(garment, views),
+        "flattened_view": messages.flattened_view_fields(garment, views, item),
+        "garment": messages.garment_estimate_fields(garment, views, item),
         "contour": displays.contour_fields(garment),
         "markers": displays.marker_fields(garment, views),
         "points": displays.points_fields(garment, views),

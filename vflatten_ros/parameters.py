@@ -130,9 +130,7 @@ class CalibrationOptions(Checked):
     joint: str = option("", "Name of the wrist joint in the joint states.", read_only=True)
     joint_sign: float = option(
         1.0,
-        "+1 where the item angle grows with the joint, else -1.",
-        low=-1.0,
-        high=1.0,
+        "+1 or -1: +1 where the item angle grows with the joint.",
         read_only=True,
     )
     joint_zero: float = option(0.0, "Joint position at item angle 0, rad.", read_only=True)
@@ -142,6 +140,14 @@ class CalibrationOptions(Checked):
         "z up along the wrist axis. Frame, joint, sign and zero are still given.",
         read_only=True,
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.joint_sign not in (1.0, -1.0):
+            raise InvalidConfig(
+                f"calibration.joint_sign: expected +1 or -1, got {self.joint_sign:g}; "
+                "+1 where the item angle grows with the joint"
+            )
 
 
 @dataclass(frozen=True)
@@ -258,6 +264,7 @@ class Parameters:
         self._warn_unknown(node)
         for entry in self._entries.values():
             self._declare(node, entry)
+        _check_together(self.settings)
         node.add_on_set_parameters_callback(self._on_set)
 
     def _declare(self, node: Node, entry: Entry) -> None:
@@ -302,7 +309,20 @@ class Parameters:
                     f"{change.name} cannot change while the node is active; deactivate it first"
                 )
             values[change.name] = value
-        return self.settings.changed(values)
+        settings = self.settings.changed(values)
+        if settings.core.buffer != self.settings.core.buffer:
+            _check_together(settings)
+        return settings
+
+
+def _check_together(settings: Settings) -> None:
+    """What each setting's own range does not say; raises InvalidConfig."""
+    buffer = settings.core.buffer
+    if buffer.max_views < buffer.min_views:
+        raise InvalidConfig(
+            f"buffer.max_views {buffer.max_views} is below buffer.min_views {buffer.min_views}: no "
+            "rotation would ever be complete; raise the one, or first lower the other"
+        )
 
 
 def _to_ros(value: Any) -> Any:

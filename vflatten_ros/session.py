@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from vflatten_ros import messages
@@ -12,15 +13,17 @@ from vflatten_ros.core.buffer import ViewBuffer
 from vflatten_ros.core.config import METHODS, Config
 from vflatten_ros.core.errors import InvalidCorrespondence, VFlattenError
 from vflatten_ros.core.events import CloudDropped, Event, ItemStarted, Stage
-from vflatten_ros.core.joints import MAX_POSITION_RAD
+from vflatten_ros.core.joints import position_fault
 from vflatten_ros.core.values import Calibration, Cloud, Correspondence, View
 from vflatten_ros.goals import Task
 
 OK, INVALID_ARGUMENT, UNKNOWN_VIEW, UNKNOWN_NAME, NO_VIEWS, NO_RESULT = range(6)  # msg/Status
-NOT_ACTIVE, BUSY, CANCELLED, FAILED, PARTLY, NOT_SEEN = range(6, 12)
+NOT_ACTIVE, BUSY, CANCELLED, FAILED, PARTLY, NOT_SEEN, NOT_HELD, NO_JOINT_STATE = range(6, 14)
+UNKNOWN_ID = UNKNOWN_VIEW
 
 MAX_PAIRS = 1000  # held, and in one request: each is looked up in its views, 1 ms or so
 MAX_IDS = 100_000  # in one request
+Places = frozenset[tuple[int, tuple[int, int]]]  # view and pixel of both sides
 
 
 class Refused(VFlattenError):
@@ -31,14 +34,23 @@ class Refused(VFlattenError):
         self.code = code
 
 
+@dataclass(frozen=True)
+class Wrist:
+    """The wrist's newest joint state."""
+
+    position_rad: float
+    stamp_ns: int
+    received_ns: int  # steady clock: stamps may be of another clock than ours
+
+
 class Session:
     """The buffer of the present item and what was asked about it. Not thread-safe."""
 
-    def __init__(self, calibration: Calibration, config: Config) -> None:
+    def __init__(self, calibration: Calibration, config: Config, items_before: int = 0) -> None:
         self.calibration = calibration
-        self.buffer = ViewBuffer(calibration, config)
+        self.buffer = ViewBuffer(calibration, config, items_before)
         self.pairs: dict[int, Correspondence] = {}
-        self.wrist_rad: float | None = None  # newest joint position
+        self.wrist: Wrist | None = None
         self.enough = False  # a result so far says that further views would hardly change it
         self._looked_rad = 0.0  # angle covered when the last early look began
         self._selection: tuple[int, ...] | None = None
@@ -50,9 +62,9 @@ class Session:
         self, stamp_ns: int, names: Sequence[str], positions: Sequence[float], now_ns: int
     ) -> tuple[Event, ...]:
         """Take one joint state."""
-        wrist = dict(zip(names, positions, strict=False)).get(self.calibration.joint, math.nan)
-        if abs(wrist) <= MAX_POSITION_RAD:
-            self.wrist_rad = float(wrist)
+        position = dict(zip(names, positions, strict=False)).get(self.calibration.joint)
+        if position is not None and not position_fault(position):
+            self.wrist = Wrist(float(position), stamp_ns, now_ns)
         return self._noted(self.buffer.add_joint(stamp_ns, names, positions, now_ns))
 
     def add_cloud(self, cloud: Cloud, now_ns: int) -> tuple[Event, ...]:
@@ -70,6 +82,26 @@ class Session:
     def new_item(self, cause: str) -> tuple[Event, ...]:
         """Forget the present item."""
         return self._noted(self.buffer.new_item(cause))
+
+    def item_angle(self, now_ns: int, limit_s: float) -> tuple[float, int]:
+        """Item angle of the newest joint state, and its stamp.
+
+        Raises
+        ------
+        Refused
+            There is none, or it came longer ago than `limit_s`.
+        """
+        joint = self.calibration.joint
+        if self.wrist is None:
+            raise Refused(NO_JOINT_STATE, f"no state of joint {joint!r} has come; give item_angle")
+        age_s = (now_ns - self.wrist.received_ns) * 1e-9
+        if age_s > limit_s:
+            raise Refused(
+                NO_JOINT_STATE,
+                f"the newest state of joint {joint!r} came {age_s:.1f} s ago, no_data_warning_s "
+                f"allows {limit_s:g} s; does the robot still send? Or give item_angle",
+            )
+        return self.calibration.item_angle_rad(self.wrist.position_rad), self.wrist.stamp_ns
 
     def clock_set_back(self, to_ns: int) -> tuple[Event, ...]:
         """Forget what is stamped later than the clock, which was set back."""
@@ -150,18 +182,21 @@ class Session:
 
     def add_pairs(self, pairs: Iterable[Mapping[str, Any]]) -> list[tuple[int, str]]:
         """Check and keep pairs of vflatten_ros/Correspondence fields: id (0: refused), reason."""
-        views = self.views()
-        return [self._add_pair(pair, views) for pair in pairs]
+        views, held = self.views(), set(map(_places, self.pairs.values()))
+        return [self._add_pair(pair, views, held) for pair in pairs]
 
-    def _add_pair(self, fields: Mapping[str, Any], views: Mapping[int, View]) -> tuple[int, str]:
+    def _add_pair(
+        self, fields: Mapping[str, Any], views: Mapping[int, View], held: set[Places]
+    ) -> tuple[int, str]:
         if len(self.pairs) >= MAX_PAIRS:
             return 0, f"there are {MAX_PAIRS} pairs already; clear some"
         try:
             pair = messages.correspondence_from_fields(fields, views)
         except InvalidCorrespondence as error:
             return 0, str(error)
-        if pair in self.pairs.values():
+        if _places(pair) in held:
             return 0, "the same pair is already there"
+        held.add(_places(pair))
         self.pairs[self._next_pair] = pair
         self._next_pair += 1
         return self._next_pair - 1, ""
@@ -189,11 +224,22 @@ class Session:
         chosen = self._known(ids) or self.selected()
         if not chosen:
             raise Refused(NO_VIEWS, "the buffer holds no views; turn the item before the rig first")
+        if config.method == "rotation" and len(chosen) < 2:
+            raise Refused(
+                NO_VIEWS,
+                f"method rotation needs two views or more, got {len(chosen)}; turn the item, or "
+                "select more of the views held",
+            )
         kept = set(chosen)
         pairs = [self.pairs[i] for i in sorted(self.pairs)]
         pairs = [pair for pair in pairs if {pair.view_a, pair.view_b} <= kept]
         item = self.buffer.state().item
         return Task(tuple(held[i] for i in chosen), tuple(pairs), config, item)
+
+
+def _places(pair: Correspondence) -> Places:
+    """What a pair joins, whichever side is named first and whoever gave it."""
+    return frozenset({(pair.view_a, pair.pixel_a), (pair.view_b, pair.pixel_b)})
 
 
 def _check_count(ids: Sequence[int]) -> None:

@@ -23,7 +23,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
 from vflatten_ros.core.config import Config
-from vflatten_ros.core.errors import Cancelled, VFlattenError
+from vflatten_ros.core.errors import Cancelled, NotEnoughViews, VFlattenError
 from vflatten_ros.core.values import Correspondence, FlatGarment, Progress, View
 from vflatten_ros.processes import keep_little
 
@@ -41,6 +41,7 @@ class Job:
     view_keys: tuple[int, ...]
     correspondences: tuple[Correspondence, ...]
     config: Config
+    item: int = 0  # which item the views are of
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class Outcome:
     seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> wall time
     error: str = ""
     cancelled: bool = False
+    few_views: bool = False  # the error is that the method needs more
 
 
 @dataclass(frozen=True)
@@ -140,11 +142,16 @@ class Worker:
         self._outbox.put(("view", self._keys[view], view, self._config))
 
     def submit(
-        self, number: int, views: Sequence[View], pairs: Sequence[Correspondence], config: Config
+        self,
+        number: int,
+        views: Sequence[View],
+        pairs: Sequence[Correspondence],
+        config: Config,
+        item: int = 0,
     ) -> None:
         """Begin a job on views that were kept before."""
         keys = tuple(self._keys[view] for view in views)
-        self._outbox.put(("job", Job(number, keys, tuple(pairs), config)))
+        self._outbox.put(("job", Job(number, keys, tuple(pairs), config, item)))
 
     def cancel(self, number: int) -> None:
         """Ask a job to stop; its outcome says that it was cancelled."""
@@ -344,7 +351,8 @@ def _outcome(work: Work, job: Job, views: list[View], report: _Reporter) -> Outc
     except Cancelled as error:
         return Outcome(job.number, error=str(error), cancelled=True)
     except VFlattenError as error:
-        return Outcome(job.number, error=str(error))
+        few = isinstance(error, NotEnoughViews)
+        return Outcome(job.number, error=str(error), few_views=few)
     except Exception:  # our own mistake must not take the process with it
         trace = traceback.format_exc()
         return Outcome(job.number, error=f"internal error, please report it:\n{trace}")

@@ -15,6 +15,7 @@ from vflatten_ros.core.buffer import (
     ViewAdded,
     ViewBuffer,
     ViewReplaced,
+    WristStill,
 )
 from vflatten_ros.core.config import config_from
 from vflatten_ros.core.values import Calibration, Cloud
@@ -206,6 +207,138 @@ def test_a_rotation_with_a_dropped_cloud_is_complete_and_a_half_is_not():
     assert not any(isinstance(e, RotationComplete) for e in events)
     # 12 views 15 degrees apart, and half of the largest gap that counts at either end
     assert half.state().angle_covered_rad == pytest.approx(np.radians(11 * 15 + 45))
+
+
+def test_a_rotation_whose_views_are_cleared_is_complete_no_longer_and_may_be_again():
+    buffer = make()
+    turn_round(buffer, 12)
+    buffer.clear_views([3])  # its neighbours are 60 degrees apart
+    assert buffer.state().stage is Stage.GATHERING
+    buffer.clear_views(range(12))
+    assert buffer.state().stage is Stage.WAITING
+    events = turn_round(buffer, 12, start_s=6.5)
+    assert len([e for e in events if isinstance(e, RotationComplete)]) == 1
+    assert check_accounts(buffer).stage is Stage.COMPLETE
+
+
+def test_a_complete_rotation_that_stays_so_when_a_view_is_cleared_is_told_once():
+    buffer = make()
+    turn_round(buffer, 36)
+    buffer.clear_views([3])
+    assert buffer.state().stage is Stage.COMPLETE
+    assert not any(isinstance(e, RotationComplete) for e in turn_round(buffer, 36, start_s=18.5))
+
+
+def test_a_wrist_that_does_not_turn_is_told_once_for_an_item_with_what_came():
+    buffer = make(**{"joints.history_s": 100.0})
+    for start in (0, 15 * S):
+        joints(buffer, start / S, start / S + 14, rate=0.0)
+        told = []
+        for k in range(1, 25):
+            events = buffer.add_cloud(cloud(start + k * S // 2), 0)
+            told += [e for e in events if isinstance(e, WristStill)]
+        assert told == [WristStill(0.0, 11)]  # ten steps are five seconds
+        assert buffer.state().still == WristStill(0.0, 24)
+        buffer.new_item()
+        assert buffer.state().still is None
+
+
+def test_a_wrist_that_waits_a_little_or_turns_slowly_is_not_said_to_be_still():
+    waiting, slow = make(), make()
+    joints(waiting, 0, 5, rate=0.0)
+    joints(slow, 0, 14, rate=0.02)
+    for k in range(8):
+        waiting.add_cloud(cloud(S + k * S // 2), 0)
+    for k in range(24):
+        slow.add_cloud(cloud(S + k * S // 2), 0)
+    assert waiting.state().still is slow.state().still is None
+
+
+def test_what_became_of_the_last_clouds_is_known():
+    buffer = make()
+    joints(buffer, 0, 14, rate=0.0)
+    buffer.add_cloud(cloud(1 * S), 0)
+    buffer.add_cloud(cloud(2 * S, shift=0.05), 0)
+    buffer.add_cloud(cloud(3 * S, shift=0.05, rows=30), 0)
+    buffer.clear_views([1])
+    assert buffer.state().recent == ("", "item_swinging", "duplicate_angle")
+    for _ in range(30):
+        buffer.reject_cloud("lies", 0)
+    assert buffer.state().recent == ("invalid_cloud",) * 20
+
+
+@pytest.mark.parametrize(
+    "positions, fault",
+    [
+        ((), "no position"),
+        ((np.nan,), "position nan"),
+        ((1e9,), "position 1e+09, beyond 10000 rad"),
+    ],
+)
+def test_joint_states_without_a_position_are_counted_and_named(positions, fault):
+    buffer = make()
+    for k in range(3):
+        buffer.add_joint(k, ("wrist",), positions, 0)
+    buffer.add_cloud(cloud(S), 0)
+    (event,) = buffer.tick(2 * S)
+    assert event.text == (
+        f"3 states of joint 'wrist' came, none with a position; the newest has {fault}"
+    )
+    assert (buffer.state().joint_faults, buffer.state().joint_fault) == (3, fault)
+    joints(buffer, 0, 1)
+    assert buffer.state().joint_fault == ""
+    buffer.add_joint(2 * S, ("wrist",), positions, 0)
+    buffer.add_cloud(cloud(4 * S), 2 * S)
+    (event,) = buffer.tick(4 * S)
+    assert event.reason == "too_old" and event.text.endswith(f"; the newest has {fault}")
+
+
+def with_points(xyz):
+    return dataclasses.replace(cloud(S), xyz=np.array(xyz, np.float32))
+
+
+@pytest.mark.parametrize(
+    "xyz, text",
+    [
+        (np.zeros((0, 0, 3)), "none of its 0 x 0 points is measured"),
+        (np.zeros((4, 5, 3)), "none of its 4 x 5 points is measured (all NaN or zero)"),
+        (np.full((4, 5, 3), np.nan), "none of its 4 x 5 points is measured"),
+        (np.full((4, 5, 3), 1300.0), "are these millimetres?"),
+        (np.full((4, 5, 3), 13.0), "item points below the gripper tip"),
+    ],
+)
+def test_a_cloud_that_shows_nothing_says_why(xyz, text):
+    (event,) = make().add_cloud(with_points(xyz), 0)
+    assert event.reason == "empty_after_segmentation"
+    assert text in event.text
+
+
+def test_a_cloud_without_a_stamp_is_told_so_wherever_it_is_dropped():
+    buffer = make()
+    joints(buffer, 10, 12)
+    (old,) = buffer.add_cloud(cloud(0), 0)
+    buffer.clock_set_back(5 * S)
+    (before,) = buffer.add_cloud(cloud(0), 0)
+    simulated = make()  # its time begins at 0
+    joints(simulated, 0, 2)
+    simulated.add_cloud(cloud(S // 2), 0)
+    (back,) = simulated.add_cloud(cloud(0), 0)
+    reasons = [event.reason for event in (old, back, before)]
+    assert reasons == ["too_old", "time_went_backwards", "previous_item"]
+    assert all("the cloud's stamp is 0" in event.text for event in (old, back, before))
+
+
+def test_open_fingers_are_known():
+    buffer = make()
+    for at, position, is_open in ((1, 0.0, False), (2, 0.03, True), (3, 0.0, False)):
+        buffer.add_joint(at * S, ("finger_left", "finger_right"), (position, position), 0)
+        assert buffer.fingers_open == is_open
+
+
+def test_items_go_on_from_a_number():
+    buffer = ViewBuffer(CALIBRATION, config_from({}), items_before=4)
+    assert buffer.state().item == 5
+    assert buffer.new_item() == (ItemStarted(6, "requested"),)
 
 
 def test_of_two_views_at_one_angle_the_better_stays():

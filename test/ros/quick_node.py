@@ -22,7 +22,7 @@ class QuickWork(slow_work.SlowWork):
             correspondences=task.correspondences,
             enough=len(views) >= slow_work.ENOUGH,
         )
-        return towel, job.serialized(towel, views)
+        return towel, job.serialized(towel, views, task.item)
 
 
 def loader(folder):

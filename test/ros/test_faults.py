@@ -11,6 +11,7 @@ import slow_work
 from lifecycle_msgs.msg import Transition
 from ros_rig import CALIBRATION, RECORDING, Rig, recorded
 from sensor_msgs.msg import JointState, PointCloud2, PointField
+from std_srvs.srv import Trigger
 
 from vflatten_ros import msg
 from vflatten_ros.bag import RecordedCloud, RecordedJoints
@@ -114,6 +115,10 @@ def test_a_clock_that_jumps_back_begins_a_new_item(rig):
     assert not second.drop_counts
     assert int(rig.diagnostics()["buffer"]["clock jumps"]) == jumps + 1
     assert "stamps went back" in rig.node.log()
+    rig.turn()
+    third = rig.until(lambda: (b := rig.complete()) and b.item > second.item and b, "one more")
+    for item in (second.item, third.item):  # a looped bag has a line for each
+        assert f"item {item} begins: the clock was set back" in rig.node.log()
 
 
 def test_a_player_that_is_killed_and_started_again(rig):
@@ -231,9 +236,42 @@ def test_the_end_waits_for_the_callback_at_hand(ros, tmp_path, how):
         rig.until(lambda: rig.node.log().endswith("begins\n"), "a callback")
         (worker,) = rig.node.children()
         assert rig.node.stop(how) == 0
-        assert rig.node.log().endswith("ended\n")  # no traceback, and nothing begun anew
+        log = rig.node.log()
+        assert log.count("begins\n") == log.count("ended\n")  # nothing is begun anew
+        assert "Traceback" not in log
+        assert log.splitlines()[-1].endswith(f"the node ends: {how.name}")
         with pytest.raises(ProcessLookupError):
             os.kill(worker, 0)
+    finally:
+        rig.close()
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_who_waits_for_a_result_is_answered_when_the_node_ends(ros, tmp_path, how):
+    rig = Rig(tmp_path, arguments=["--calibration", str(CALIBRATION)])
+    try:
+        rig.set_parameter("auto_flatten", False)
+        rig.set_parameter("geodesics.nodes", slow_work.STUBBORN)
+        rig.turn()
+        rig.until(rig.complete, "the rotation")
+        goals = [rig.send_goal(view_ids=ids) for ids in ([1, 2], [3, 4])]
+        results = [goal.get_result_async() for goal in goals]
+        line = rig.planner.create_client(Trigger, "vflatten/flatten")
+        rig.until(line.service_is_ready, "the service")
+        called = line.call_async(Trigger.Request())
+        rig.until(lambda: rig.ask("state").flattening, "the work to begin")
+        rig.until(lambda: rig.diagnostics()["flattening"]["waiting"] == "2", "the queue")
+        os.kill(rig.node.pid, how)
+        answers = [rig.result_of(result) for result in results]
+        for answer in answers:
+            assert answer.status == 6  # action_msgs/GoalStatus.STATUS_ABORTED
+            assert answer.result.status.code == msg.Status.CANCELLED
+            assert f"the node was ended ({how.name})" in answer.result.status.message
+        answer = rig.result_of(called)
+        assert not answer.success and "the node was ended" in answer.message
+        assert rig.node.wait() == 0
+        assert f"the node ends: {how.name}" in rig.node.log()
+        assert "3 requests for a result are abandoned" in rig.node.log()
     finally:
         rig.close()
 

@@ -1,6 +1,7 @@
 """What becomes of every cloud: each reason to drop one, as a planner and an operator see it."""
 
 import runpy
+import signal
 import types
 
 import numpy as np
@@ -73,8 +74,10 @@ def reactivate(rig):
 
 def test_every_reason_to_drop_a_cloud_is_counted_reported_and_explained(rig):
     reactivate(rig)
-    changed = {"joints.wait_s": 0.3, "buffer.max_rate_rad_s": 1.0, "buffer.max_views": 3}
+    changed = {"joints.wait_s": 0.3, "buffer.max_rate_rad_s": 1.0, "buffer.min_views": 3}
+    changed |= {"buffer.max_views": 3}
     before = {"joints.wait_s": 1.0, "buffer.max_rate_rad_s": 0.0, "buffer.max_views": 128}
+    before |= {"buffer.min_views": 6}
     for name, value in changed.items():
         assert rig.set_parameter(name, value).successful
     arm = Turning(rig)
@@ -124,6 +127,65 @@ def test_every_reason_to_drop_a_cloud_is_counted_reported_and_explained(rig):
         assert rig.set_parameter(name, value).successful
     reactivate(rig)
     rig.serves_a_good_rotation()
+
+
+def test_a_wrist_that_does_not_turn_is_told_in_the_log_and_in_the_diagnostics(rig):
+    reactivate(rig)
+    arm = Turning(rig)
+    arm.turn(1.0)
+    for number in range(12):
+        arm.turn(0.5)
+        arm.see(arm.now_s - 0.2, "duplicate_angle" if number else None)
+    text = "wrist joint 'wrist_roll' has moved by 0.000 rad while {} clouds came; does the joint"
+    assert rig.node.log().count(text.format(11)) == 1
+    assert text.format(12) in rig.diagnostics()["buffer"][""]
+    reactivate(rig)
+
+
+def test_joint_states_without_a_position_are_told(rig):
+    reactivate(rig)
+    rig.publish(JointState(name=["finger_left", "wrist_roll"], position=[0.0]))
+    rig.publish(JointState(name=["wrist_roll"], position=[np.nan]))
+    said = "states of joint 'wrist_roll' came without a usable position, the newest has"
+    rig.until(lambda: said in rig.node.log(), "a warning")
+    shown = rig.until(
+        lambda: (
+            (now := rig.diagnostics()["buffer"])["joint states without a position"] == "2" and now
+        ),
+        "both",
+    )
+    assert f"2 {said} position nan" in shown[""]
+    reactivate(rig)
+
+
+def test_most_of_the_last_clouds_dropped_is_told_though_there_are_views(rig):
+    reactivate(rig)
+    arm = Turning(rig)
+    arm.turn(4.0, rate=0.5)
+    for at_s in (1.5, 2.0, 2.5):
+        arm.see(at_s)
+    arm.see(3.0, "wrong_frame", frame="map")
+    assert "of the last" not in rig.diagnostics()["buffer"][""]
+    for at_s in (3.1, 3.2, 3.3):
+        arm.see(at_s, "wrong_frame", frame="map")
+    text = "4 of the last 7 clouds dropped, most as wrong_frame: correct the frame"
+    assert text in rig.diagnostics()["buffer"][""]
+    reactivate(rig)
+
+
+def test_each_way_in_which_a_cloud_is_wrong_is_told(rig):
+    reactivate(rig)
+    arm = Turning(rig)
+    for lies in ({"fields": []}, {"point_step": 2}, {"data": b""}):
+        arm.see(1.0, "invalid_cloud", **lies)
+    arm.see(1.0, "empty_after_segmentation", data=np.zeros(60 * 30 * 3, "<f4").tobytes())
+    arm.see(1.0, "empty_after_segmentation", data=np.full(60 * 30 * 3, 1300, "<f4").tobytes())
+    lines = rig.node.log().splitlines()
+    kinds = {line.split("invalid_cloud: ")[1] for line in lines if "invalid_cloud: " in line}
+    assert len(kinds) >= 3, kinds
+    assert any("none of its 60 x 30 points is measured" in line for line in lines)
+    assert any("are these millimetres?" in line for line in lines)
+    reactivate(rig)
 
 
 def test_an_item_that_fills_the_image_is_told_as_it_arrives(rig):
@@ -223,6 +285,31 @@ def test_the_planner_gathers_again_where_its_views_are_gone():
     with pytest.raises(example.NoViews):  # nobody turns it once more
         gather_and_flatten(turned_it_itself, object(), {"views": []}, "rotation")
     assert turned_it_itself.gathered == 1
+
+
+def test_a_planner_without_a_recording_says_so_at_once(ros, tmp_path):
+    planner = Process(["examples/planner.py", str(tmp_path / "nowhere")], tmp_path / "log")
+    assert planner.wait() == 1
+    (line,) = planner.log().splitlines()
+    assert line.startswith("planner: ") and "nowhere: no such recording" in line
+
+
+def test_a_recording_that_cannot_be_played_is_no_lack_of_views(ros, rig, tmp_path):
+    arguments = ["examples/planner.py", str(tmp_path), "--node", f"{rig.namespace}/vflatten"]
+    planner = Process(arguments, tmp_path / "log")
+    assert planner.wait() == 1
+    assert "the recording was not played (exit code 1)" in planner.log()
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_a_planner_that_is_interrupted_ends_without_a_traceback(rig, tmp_path, how):
+    arguments = ["examples/planner.py", str(CALIBRATION.parent), "--rate", "1"]
+    arguments += ["--node", f"{rig.namespace}/vflatten", "--namespace", rig.namespace]
+    planner = Process(arguments, tmp_path / "log")
+    rig.until(lambda: "views: " in planner.log(), "the first view")
+    assert planner.stop(how) == 130
+    assert "Traceback" not in planner.log()
+    rig.serves_a_good_rotation()
 
 
 def test_planners_as_processes_at_once_each_get_a_result(rig, tmp_path):

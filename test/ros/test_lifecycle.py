@@ -8,6 +8,7 @@ import rclpy
 import slow_work
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import ParameterType
+from rclpy.parameter import Parameter
 from ros_rig import CALIBRATION, REAL, ROOT, Process, Rig
 from sensor_msgs.msg import JointState
 from vflatten_ros.msg import Status
@@ -61,9 +62,19 @@ def test_every_transition_in_every_state_gets_an_answer(rig):
                 assert not change(rig, transition), (state, transition)
                 assert rig.lifecycle_state() == state
         assert not change(rig, 0, "no such transition")
+    item = rig.buffer().item
+    assert change(rig, 0, "deactivate")
+    assert change(rig, ACTIVATE)
+    assert rig.buffer().item == item + 1  # numbers are not used twice
     assert change(rig, 0, "deactivate")
     assert change(rig, 0, "cleanup")
     assert rig.lifecycle_state() == UNCONFIGURED
+    for text in (
+        "refused: cleanup (2) is not possible while active; possible: deactivate, shutdown",
+        "inactive: clouds and joint states are no longer taken",
+        "unconfigured: the flattening process has ended",
+    ):
+        assert text in rig.node.log()
 
 
 def test_services_answer_in_every_state_and_say_what_is_missing(rig):
@@ -139,6 +150,7 @@ def test_parameters_are_described_and_changes_refused_with_a_reason(rig):
         ("method", "magic", "one of rotation, kita2019"),
         ("clouds.topic", "elsewhere", "deactivate it first"),
         ("buffer.max_views", -5, "range"),
+        ("buffer.max_views", 5, "no rotation would ever be complete"),
         ("segmentation.radius_m", float("nan"), ""),
     ):
         answer = rig.set_parameter(name, value)
@@ -171,6 +183,22 @@ def test_a_publisher_that_cannot_reach_the_node_is_named_with_the_remedy(rig):
     assert f"{rig.namespace}/gripper/joint_states" in line and remedy in line
     for publisher in publishers:
         rig.planner.destroy_publisher(publisher)
+
+
+def test_a_topic_of_another_type_is_told_with_the_type(rig):
+    bring(rig, UNCONFIGURED)
+    rig.set_parameter("calibration.file", str(CALIBRATION))
+    assert rig.set_parameter("clouds.topic", "somewhere").successful
+    assert rig.set_parameter("no_data_warning_s", 0.5).successful
+    bring(rig, ACTIVE)
+    rig.until(lambda: f"no cloud on {rig.namespace}/somewhere" in rig.node.log(), "a warning")
+    publisher = rig.planner.create_publisher(JointState, "somewhere", 1)
+    found = f"{rig.namespace}/somewhere is published as sensor_msgs/msg/JointState, expected"
+    rig.until(lambda: found in rig.node.log(), "the type")
+    rig.until(lambda: found in rig.diagnostics()["clouds"][""], "it in diagnostics")
+    rig.planner.destroy_publisher(publisher)
+    bring(rig, INACTIVE)
+    assert rig.set_parameter("clouds.topic", "rig/points").successful
 
 
 def test_settings_from_a_file_and_over_it_those_given_by_themselves(ros, tmp_path):
@@ -226,6 +254,7 @@ def test_a_finalized_node_still_answers(rig, state, shutdown):
     for transition in ALL:
         assert not change(rig, transition)
     assert rig.lifecycle_state() == FINALIZED
+    assert "finalized: the node does nothing any more" in rig.node.log()
     assert not rig.node.children()  # the flattening process is gone
     assert rig.ask("new_item").message.startswith("the node is finalized")
     assert rig.node.stop() == 0
@@ -291,11 +320,41 @@ def test_a_mistake_of_ours_in_a_transition_leads_back_to_unconfigured(ros):
         node.destroy_node()
 
 
+def test_settings_of_the_flattening_process_count_until_the_activation(ros, tmp_path):
+    given = []
+
+    def loader(options):
+        given.append((options.categories, options.worker_processes))
+        return slow_work.load
+
+    node = FlattenNode("changed", loader=loader)
+    try:
+        node.set_parameters([Parameter("calibration.file", value=str(CALIBRATION))])
+        node.trigger_configure()
+        categories = str(ROOT / "config" / "categories")
+        for name, value in (("categories", categories), ("worker_processes", 1)):
+            (answer,) = node.set_parameters([Parameter(name, value=value)])
+            assert answer.successful
+        node.trigger_activate()
+        assert given == [("", 2), (categories, 1)]
+        node.trigger_deactivate()
+        node.trigger_activate()
+        assert len(given) == 2  # nothing has changed
+        node.trigger_deactivate()
+        node.set_parameters([Parameter("categories", value=str(tmp_path / "nowhere"))])
+        node.trigger_activate()
+        assert node.lifecycle_state()[0] == INACTIVE
+        assert "nowhere" in node.trouble
+    finally:
+        node.destroy_node()
+
+
 @pytest.mark.parametrize(
     "arguments, code, reason",
     [
         (["--ros-args", "-p", "geodesics.nodes:=1"], 1, "geodesics.nodes"),
         (["--ros-args", "-p", "method:=5"], 1, "method"),
+        (["--ros-args", "-p", "buffer.max_views:=5"], 1, "buffer.min_views 6"),
         (["--nonsense"], 2, "--nonsense"),
     ],
 )

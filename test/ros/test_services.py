@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import slow_work
 from geometry_msgs.msg import Point
-from ros_rig import RECORDING
-from vflatten_ros.msg import Correspondence, Status
+from ros_rig import LATCHED, RECORDING, recorded
+from sensor_msgs.msg import Image, JointState
+from vflatten_ros.msg import Correspondence, GarmentEstimate, Status
 
 CENTRE = [240, 180]
 
@@ -44,7 +46,7 @@ def test_pairs_are_added_listed_and_cleared(turned):
     cleared = turned.ask("clear_correspondences", ids=[added.ids[0], 4_000_000_000])
     assert (cleared.status.code, cleared.removed) == (Status.PARTLY, 1)
     assert turned.ask("clear_correspondences").removed == len(pairs) - 1
-    assert turned.ask("clear_correspondences", ids=[1]).status.code == Status.INVALID_ARGUMENT
+    assert turned.ask("clear_correspondences", ids=[1]).status.code == Status.UNKNOWN_ID
 
 
 def absurd_pairs():
@@ -87,7 +89,7 @@ def test_views_are_listed_selected_and_cleared(turned):
     cleared = turned.ask("clear_views", ids=[0, 1, 2**32 - 1])
     assert (cleared.status.code, cleared.removed) == (Status.PARTLY, 2)
     assert turned.drops() == {"cleared": 2}
-    assert turned.ask("clear_views", ids=[0]).status.code == Status.UNKNOWN_VIEW
+    assert turned.ask("clear_views", ids=[0]).status.code == Status.UNKNOWN_ID
     item = turned.buffer().item
     assert turned.ask("clear_views").removed == 22
     assert turned.buffer().item == item + 1
@@ -104,8 +106,15 @@ def test_absurd_goals_end_with_their_code(turned):
         assert answer.result.status.code == code
         assert answer.status == 6  # action_msgs/GoalStatus.STATUS_ABORTED
         assert len(answer.result.status.message) < 300
+    few = turned.flatten(method="rotation", view_ids=[3]).result.status
+    assert few.code == Status.NO_VIEWS and "got 1; turn the item" in few.message
     turned.ask("new_item")
     assert turned.flatten().result.status.code == Status.NO_VIEWS
+    refused = "method 'magic'", "view 4294967295 is not", "method rotation", "the buffer holds no"
+    for reason in refused:
+        assert f"a goal was refused: {reason}" in turned.node.log()
+    shown = turned.diagnostics()["flattening"]
+    assert int(shown["refused"]) >= 6 and "no views" in shown["last refusal"]
 
 
 def test_absurd_angles_and_frames_of_landmarks_are_refused(turned):
@@ -116,3 +125,143 @@ def test_absurd_angles_and_frames_of_landmarks_are_refused(turned):
         )
         assert answer.status.code == Status.INVALID_ARGUMENT
     assert turned.ask("locate_landmark").status.code == Status.UNKNOWN_NAME
+
+
+MARK = "left_top_corner"
+
+
+def later(seconds, **positions):
+    """A joint state stamped so long after those of the recording."""
+    stamp_ns = recorded()[-1].log_ns + int(seconds * 1e9)
+    message = JointState(name=list(positions), position=list(positions.values()))
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    return message
+
+
+def test_a_landmark_is_located_by_the_newest_joint_state_and_stamped_as_that(turned):
+    turned.set_parameter("no_data_warning_s", 3600.0)
+    none = turned.ask("locate_landmark", name=MARK).status
+    assert none.code == Status.NO_RESULT
+    assert f"nothing of item {turned.buffer().item} has been flattened yet" in none.message
+    result = turned.flatten().result
+    assert result.status.code == Status.OK
+    newest = later(1.0, wrist_roll=0.25)
+    turned.publish(newest)
+    answer = turned.until(
+        lambda: (
+            (now := turned.ask("locate_landmark", name=MARK)).position.header.stamp
+            == newest.header.stamp
+            and now
+        ),
+        "the newest joint state",
+    )
+    assert answer.status.code == Status.OK
+    assert answer.trusted == result.estimate.trusted
+    given = turned.ask("locate_landmark", name=MARK, at_angle=True, item_angle=0.0)
+    assert given.status.code == Status.OK
+    stamp = given.position.header.stamp
+    assert (stamp.sec, stamp.nanosec) == (0, 0)  # of no moment
+    turned.set_parameter("no_data_warning_s", 5.0)
+
+
+def test_a_landmark_is_not_located_by_a_joint_state_that_came_long_ago(turned):
+    assert turned.flatten().result.status.code == Status.OK
+    turned.set_parameter("no_data_warning_s", 0.5)
+    old = turned.until(
+        lambda: (now := turned.ask("locate_landmark", name=MARK).status).code != Status.OK and now,
+        "a refusal",
+    )
+    assert old.code == Status.NO_JOINT_STATE
+    assert "no_data_warning_s allows 0.5 s" in old.message
+    given = turned.ask("locate_landmark", name=MARK, at_angle=True, item_angle=0.0)
+    assert given.status.code == Status.OK
+    turned.set_parameter("no_data_warning_s", 5.0)
+
+
+def test_an_item_that_was_let_go_hangs_nowhere(turned):
+    turned.set_parameter("no_data_warning_s", 3600.0)
+    assert turned.flatten().result.status.code == Status.OK
+    turned.publish(later(2.0, wrist_roll=0.25, finger_left=0.04, finger_right=0.04))
+    gone = turned.until(
+        lambda: (now := turned.ask("locate_landmark", name=MARK).status).code != Status.OK and now,
+        "a refusal",
+    )
+    assert gone.code == Status.NOT_HELD and "the fingers are open" in gone.message
+    given = turned.ask("locate_landmark", name=MARK, at_angle=True, item_angle=0.0)
+    assert given.status.code == Status.NOT_HELD
+    turned.publish(later(2.1, wrist_roll=0.25, finger_left=0.0, finger_right=0.0))
+    turned.until(
+        lambda: turned.ask("locate_landmark", name=MARK).status.code == Status.NO_RESULT,
+        "the next item",
+    )
+    turned.set_parameter("no_data_warning_s", 5.0)
+
+
+def heard(rig, kind, topic):
+    """What comes on a topic of results from now on, what is there already among it."""
+    messages = []
+    rig.planner.create_subscription(kind, f"vflatten/{topic}", messages.append, LATCHED)
+    return messages
+
+
+def test_a_result_of_an_item_that_is_past_goes_to_its_caller_only(turned):
+    published = heard(turned, GarmentEstimate, "garment")
+    item = turned.buffer().item
+    assert turned.flatten().result.item == item
+    turned.until(lambda: any(message.item == item for message in published), "the result")
+    turned.ask("new_item")
+    turned.turn()
+    turned.until(turned.complete, "the rotation")
+    turned.set_parameter("geodesics.nodes", slow_work.SLOW)
+    goal = turned.send_goal()
+    turned.until(lambda: turned.ask("state").flattening, "the work to begin")
+    turned.ask("new_item")
+    result = turned.result_of(goal.get_result_async()).result
+    assert result.status.code == Status.OK
+    present = turned.buffer().item
+    assert present == result.item + 1
+    assert result.estimate.item == result.flattened.item == result.item
+    turned.until(lambda: f"item {present} has begun" in turned.node.log(), "a line")
+    turned.set_parameter("geodesics.nodes", slow_work.GOOD)
+    turned.turn()
+    turned.until(turned.complete, "the rotation")
+    last = turned.flatten().result.item
+    turned.until(lambda: published[-1].item == last, "the result")
+    assert result.item not in {message.item for message in published}
+
+
+def test_an_output_that_is_switched_on_again_comes_with_the_next_goal(turned):
+    images = heard(turned, Image, "image")
+    turned.until(lambda: turned.planner.count_publishers("vflatten/image"), "the topic")
+    turned.set_parameter("outputs.image", False)
+    estimates = heard(turned, GarmentEstimate, "garment")
+    item = turned.flatten().result.item
+    turned.until(lambda: estimates and estimates[-1].item == item, "the result")
+    before = len(images)
+    turned.set_parameter("outputs.image", True)
+    assert turned.flatten().result.item == item  # of the same views: it is remembered
+    turned.until(lambda: len(images) > before, "the image")
+
+
+@pytest.mark.parametrize(
+    "work, code, reason",
+    [
+        (slow_work.MISTAKE, Status.FAILED, "internal error, please report it:"),
+        (slow_work.WRONG, Status.NO_VIEWS, "three views are needed"),
+        (slow_work.CRASH, Status.FAILED, "the flattening process ended (exit code 7)"),
+    ],
+)
+def test_a_goal_that_fails_leaves_a_line_and_its_reason_in_the_diagnostics(
+    turned, work, code, reason
+):
+    failed = int(turned.diagnostics()["flattening"]["failed"])
+    turned.set_parameter("geodesics.nodes", work)
+    answer = turned.flatten().result
+    assert answer.status.code == code and reason in answer.status.message
+    assert f"item {answer.item} not flattened: {reason}" in turned.node.log()
+    shown = turned.until(
+        lambda: "the last one failed" in (now := turned.diagnostics()["flattening"])[""] and now,
+        "the reason",
+    )
+    assert reason in shown[""]
+    assert int(shown["failed"]) == failed + 1

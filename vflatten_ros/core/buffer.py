@@ -11,7 +11,7 @@ So the same messages give the same views however joint states and clouds interle
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -31,9 +31,10 @@ from vflatten_ros.core.events import (
     Stage,
     ViewAdded,
     ViewReplaced,
+    WristStill,
 )
 from vflatten_ros.core.fingers import FingerWatch
-from vflatten_ros.core.joints import JointReading, JointStatus, JointTrack
+from vflatten_ros.core.joints import JointReading, JointStatus, JointTrack, position_fault
 from vflatten_ros.core.segmentation import segment, view_at
 from vflatten_ros.core.turntable import (
     TURN,
@@ -56,10 +57,15 @@ __all__ = [
     "ViewAdded",
     "ViewBuffer",
     "ViewReplaced",
+    "WristStill",
 ]
 
 MOST_NAMES = 256  # joints remembered by name
 ON_ITS_WAY_NS = 300_000_000  # longest from a joint state's publication to its arrival
+RECENT = 20  # clouds
+# A wrist that has moved less while so many clouds came in so long a time does not turn.
+STILL_RAD, STILL_CLOUDS, STILL_NS = 0.1, 10, 5_000_000_000
+FAR_M = 100.0  # no rig looks farther: the numbers are not metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +77,17 @@ class _Waiting:
 class ViewBuffer:
     """Views of the present item, gathered from clouds and joint states."""
 
-    def __init__(self, calibration: Calibration, config: Config) -> None:
+    def __init__(self, calibration: Calibration, config: Config, items_before: int = 0) -> None:
+        """`items_before`: the first item's number is the next one."""
         self._calibration = calibration
         self._config = config
         self._track = JointTrack(config.joints)
         self._fingers = FingerWatch(config.buffer)
         self._joints_seen: set[str] = set()
-        self._item = 0
+        self._item = items_before
         self._clock_jumps = 0
+        self._joint_faults = 0
+        self._joint_fault = ""
         self._now_ns = 0
         self._suspect: tuple[int, float] | None = None
         self._outdated: tuple[int, int] | None = None  # stamps from, received until
@@ -102,8 +111,12 @@ class ViewBuffer:
             return self._settle(received_ns)
         values = dict(zip(names, positions, strict=False))
         events: list[Event] = []
-        if self._calibration.joint in values:
-            events += self._add_wrist(stamp_ns, float(values[self._calibration.joint]))
+        if self._calibration.joint in names:
+            position = values.get(self._calibration.joint)
+            self._joint_fault = position_fault(position)
+            self._joint_faults += bool(self._joint_fault)
+            if position is not None:
+                events += self._add_wrist(stamp_ns, float(position))
         closed_ns = self._fingers.add(stamp_ns, values)
         if closed_ns is not None:
             events += self._start_item("the fingers closed", closed_ns)
@@ -113,7 +126,7 @@ class ViewBuffer:
         """Take one decoded cloud: its item is segmented at once, its angle decided when known."""
         if self._item_start_ns is not None and cloud.stamp_ns < self._item_start_ns:
             self._received += 1  # takes no id, so that ids do not depend on how late it came
-            text = "taken before the present item was held"
+            text = "taken before the present item was held" + _unstamped(cloud.stamp_ns)
             return (self._drop(-1, "previous_item", text), *self._settle(received_ns))
         view_id = self._count_cloud()
         if cloud.frame_id != self._calibration.frame:
@@ -122,7 +135,8 @@ class ViewBuffer:
         try:
             pixel = segment(cloud, self._calibration, self._config.segmentation)
         except EmptyView as error:
-            dropped = self._drop(view_id, "empty_after_segmentation", str(error))
+            text = _unusable(cloud) or str(error)
+            dropped = self._drop(view_id, "empty_after_segmentation", text)
             return (dropped, *self._settle(received_ns))
         view = view_at(view_id, cloud, pixel, self._calibration, np.nan)
         self._waiting.append(_Waiting(view, received_ns))
@@ -165,9 +179,16 @@ class ViewBuffer:
     def clear_views(self, view_ids: Iterable[int]) -> tuple[Event, ...]:
         """Remove some views; unknown ids are left out."""
         known = sorted(set(view_ids) & set(self._views))
-        return tuple(self._remove(view_id, "cleared", "removed on request") for view_id in known)
+        events = [self._remove(view_id, "cleared", "removed on request") for view_id in known]
+        self._complete &= self._goes_round()
+        return tuple(events)
 
     # ---- what comes out
+
+    @property
+    def fingers_open(self) -> bool:
+        """Whether the fingers are open now: they hold no item."""
+        return self._fingers.open_at(2**63)
 
     def views(self) -> tuple[View, ...]:
         """The views, by id."""
@@ -188,6 +209,10 @@ class ViewBuffer:
             joint_states=len(self._track),
             joints_seen=tuple(sorted(self._joints_seen)),
             clock_jumps=self._clock_jumps,
+            recent=tuple(self._recent),
+            still=self._still(),
+            joint_faults=self._joint_faults,
+            joint_fault=self._joint_fault,
         )
 
     # ---- the item
@@ -201,6 +226,10 @@ class ViewBuffer:
         self._received = 0
         self._next_id = 0
         self._complete = False
+        self._recent: deque[str] = deque(maxlen=RECENT)
+        self._readings: list[tuple[int, float]] = []  # stamp, joint: first, lowest, highest, last
+        self._placed = 0  # clouds whose angle was known
+        self._told_still = False
         self._newest_ns: int | None = None
         self._first_turns: int | None = None
         self._item_start_ns: int | None = None
@@ -223,6 +252,8 @@ class ViewBuffer:
 
     def _drop(self, view_id: int, reason: str, text: str) -> CloudDropped:
         self._drops[reason] += 1
+        if reason != "cleared":
+            self._recent.append(reason)
         return CloudDropped(view_id, reason, text)
 
     # ---- joint states
@@ -295,7 +326,29 @@ class ViewBuffer:
             return [self._drop(view.view_id, *refused)]
         self._newest_ns = view.stamp_ns
         placed = dataclasses.replace(view, angle_rad=self._item_angle(reading))
-        return self._store(placed, abs(reading.rate_rad_s))
+        events = self._store(placed, abs(reading.rate_rad_s))
+        return [*events, *self._watch_wrist(view.stamp_ns, reading.angle_rad)]
+
+    def _watch_wrist(self, stamp_ns: int, angle_rad: float) -> list[Event]:
+        """Say once for an item that the wrist does not turn, if it does not."""
+        first, *_ = seen = [*self._readings, (stamp_ns, angle_rad)]
+        by_angle = sorted(seen, key=lambda reading: reading[1])
+        self._readings = [first, by_angle[0], by_angle[-1], seen[-1]]
+        self._placed += 1
+        still = self._still()
+        if still is None or self._told_still:
+            return []
+        self._told_still = True
+        return [still]
+
+    def _still(self) -> WristStill | None:
+        if self._placed < STILL_CLOUDS:
+            return None
+        first, lowest, highest, last = self._readings
+        moved = highest[1] - lowest[1]
+        if moved >= STILL_RAD or last[0] - first[0] < STILL_NS:
+            return None
+        return WristStill(moved, self._placed)
 
     def _item_angle(self, reading: JointReading) -> float:
         """Item angle, unwrapped; the item's first view lies between -pi and pi.
@@ -311,15 +364,17 @@ class ViewBuffer:
     def _refuse(self, view: View, reading: JointReading) -> tuple[str, str] | None:
         """Why a cloud gives no view, whatever the other views are."""
         stamp, limit = view.stamp_ns, self._config.buffer.max_rate_rad_s
-        joint = self._calibration.joint
+        joint, unstamped = self._calibration.joint, _unstamped(view.stamp_ns)
         if reading.status is JointStatus.NO_JOINT:
             return "no_joint_state", self._no_joint_text()
         if reading.status is not JointStatus.OK:
             age = f"{reading.age_s:.3f} s from the cloud's stamp"
-            return "too_old", f"joint states of {joint!r} are {age}, joints.max_age_s allows less"
+            text = f"joint states of {joint!r} are {age}, joints.max_age_s allows less"
+            return "too_old", text + self._fault_text() + unstamped
         if self._newest_ns is not None and stamp <= self._newest_ns:
             back = (self._newest_ns - stamp) * 1e-9
-            return "time_went_backwards", f"stamped {back:.3f} s before the newest view"
+            text = f"stamped {back:.3f} s before the newest view"
+            return "time_went_backwards", text + unstamped
         if self._fingers.open_at(stamp):
             return "gripper_open", "taken while the fingers were open"
         if limit and abs(reading.rate_rad_s) > limit:
@@ -327,14 +382,22 @@ class ViewBuffer:
         return None
 
     def _no_joint_text(self) -> str:
+        joint = self._calibration.joint
+        if self._joint_faults:
+            text = f"{self._joint_faults} states of joint {joint!r} came, none with a position"
+            return text + self._fault_text()
         seen = ", ".join(sorted(self._joints_seen)) or "none"
-        return f"no state of joint {self._calibration.joint!r} (joints seen: {seen})"
+        return f"no state of joint {joint!r} (joints seen: {seen})"
+
+    def _fault_text(self) -> str:
+        return f"; the newest has {self._joint_fault}" if self._joint_fault else ""
 
     def _store(self, view: View, rate: float) -> list[Event]:
         """Put a view in its place: beside the others, instead of one at its angle, or nowhere."""
         rival = self._rival(view)
         events: list[Event] = []
         if rival is None:
+            self._recent.append("")
             events.append(ViewAdded(view.view_id, view.angle_rad, len(view.points_rig)))
         else:
             swung = self._swung(view, rival)
@@ -403,11 +466,33 @@ class ViewBuffer:
         return sum(view.nbytes for view in self._views.values())
 
     def _check_complete(self, changed: bool) -> list[Event]:
-        if self._complete or not changed or len(self._views) < self._config.buffer.min_views:
-            return []
-        if not rotation_complete(self._angles(), self._max_gap_rad):
+        if self._complete or not changed or not self._goes_round():
             return []
         self._complete = True
         return [
             RotationComplete(len(self._views), angle_covered(self._angles(), self._max_gap_rad))
         ]
+
+    def _goes_round(self) -> bool:
+        enough = len(self._views) >= self._config.buffer.min_views
+        return enough and rotation_complete(self._angles(), self._max_gap_rad)
+
+
+def _unstamped(stamp_ns: int) -> str:
+    return "" if stamp_ns else "; the cloud's stamp is 0: set it in the camera driver"
+
+
+def _unusable(cloud: Cloud) -> str:
+    """What is wrong with all points of a cloud, whatever it shows; "" if nothing is."""
+    points = cloud.xyz.reshape(-1, 3)
+    away = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1)
+    away = away[away > 0.0]
+    if not len(away):
+        rows, cols = cloud.xyz.shape[:2]
+        return f"none of its {rows} x {cols} points is measured (all NaN or zero)"
+    if away.min() > FAR_M:
+        return (
+            f"its nearest point is {away.min():.0f} m away; metres are expected: "
+            "are these millimetres?"
+        )
+    return ""

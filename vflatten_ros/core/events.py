@@ -28,7 +28,7 @@ REMEDIES: Mapping[str, str] = {
     "time_went_backwards": "let one publisher only send clouds, with a clock that does not jump",
     "empty_after_segmentation": "check the calibration and segmentation.*",
     "wrist_moving_too_fast": "turn slower, or raise buffer.max_rate_rad_s",
-    "item_swinging": "wait longer after picking up",
+    "item_swinging": "wait longer after picking up; check that the joint in the calibration turns",
     "buffer_full": "raise buffer.max_views, max_megabytes or max_waiting",
     "wrong_frame": "correct the frame in the calibration or in the camera driver",
     "invalid_cloud": "correct the camera driver",
@@ -87,7 +87,23 @@ class ClockJumped:
     to_ns: int
 
 
-Event = ViewAdded | ViewReplaced | CloudDropped | ItemStarted | RotationComplete | ClockJumped
+@dataclass(frozen=True)
+class WristStill:
+    """Clouds come and the wrist joint stays where it is; once for an item."""
+
+    moved_rad: float
+    clouds: int
+
+
+Event = (
+    ViewAdded
+    | ViewReplaced
+    | CloudDropped
+    | ItemStarted
+    | RotationComplete
+    | ClockJumped
+    | WristStill
+)
 
 
 class Stage(Enum):
@@ -113,3 +129,7 @@ class BufferState:
     joint_states: int  # samples of the wrist joint kept
     joints_seen: tuple[str, ...]  # names of all joints that came, sorted
     clock_jumps: int  # since the start
+    recent: tuple[str, ...] = ()  # of each of the last clouds: "" or why it was dropped
+    still: WristStill | None = None  # while the wrist joint has not moved
+    joint_faults: int = 0  # joint states that name the wrist and give no position, since the start
+    joint_fault: str = ""  # what was wrong with the newest, if that is one of them

@@ -41,6 +41,17 @@ class JointReading:
         return self.position_rad + self.turns * TURN
 
 
+def position_fault(position: float | None) -> str:
+    """What is wrong with a joint state's position, "" if nothing is; None: there is none."""
+    if position is None:
+        return "no position"
+    if not math.isfinite(position):
+        return f"position {position}"
+    if abs(position) > MAX_POSITION_RAD:
+        return f"position {position:g}, beyond {MAX_POSITION_RAD:g} rad"
+    return ""
+
+
 class JointTrack:
     """Recent samples of one joint, turns unwrapped.
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import errno
 import os
 import re
 import sys
@@ -184,9 +183,12 @@ def _flatten(args: argparse.Namespace) -> None:
 
 def _calibrate(args: argparse.Namespace) -> None:
     from vflatten_ros.calibrate import calibrate_recording, calibration_text
-    from vflatten_ros.output_files import whole_file
+    from vflatten_ros.output_files import make_folder, make_room, whole_file
 
-    _make_room(args.output, args.figures / "axis.png" if args.figures else None)
+    if args.output:
+        make_room(args.output)
+    if args.figures:
+        make_folder(args.figures)
     with Stages(_show_bar(args)) as stages:
         found = calibrate_recording(
             args.recording,
@@ -211,20 +213,13 @@ def _calibrate(args: argparse.Namespace) -> None:
 
 
 def _prepare_outputs(args: argparse.Namespace) -> None:
-    """Make the folders asked for."""
-    _make_room(args.json, args.mcap)
+    """What cannot be written fails before the work, not after it."""
+    from vflatten_ros.output_files import make_folder, make_room
+
+    for path in filter(None, (args.json, args.mcap)):
+        make_room(path)
     if args.figures:
-        args.figures.mkdir(parents=True, exist_ok=True)
-
-
-def _make_room(*paths: Path | None) -> None:
-    """Folders of files: what cannot be written fails before the work, not after it."""
-    for path in filter(None, paths):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, "is a folder, expected a file", str(path))
-        if not os.access(path.parent, os.W_OK):
-            raise PermissionError(errno.EACCES, "cannot be written to", str(path.parent))
+        make_folder(args.figures)
 
 
 def _write(args: argparse.Namespace, replayed: Replayed, stages: Stages) -> None:

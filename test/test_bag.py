@@ -19,6 +19,7 @@ from recordings import (
     write_mcap,
 )
 
+from vflatten_ros import mcap_files
 from vflatten_ros.bag import RecordedCloud, RecordedJoints, gather_views, open_recording
 from vflatten_ros.core.calibration import calibration_from
 from vflatten_ros.core.config import Config
@@ -91,6 +92,20 @@ def test_split_files_without_metadata_are_read_in_order_of_number(tmp_path):
     write_bag(folder, [messages[k * 34 : (k + 1) * 34] for k in range(12)])
     (folder / "metadata.yaml").unlink()
     assert contents(folder) == contents(write_mcap(tmp_path / "one.mcap", messages))
+
+
+def test_a_file_that_counts_nothing_leaves_the_count_of_all_unknown(tmp_path, monkeypatch):
+    """A recorder that was killed wrote no statistics; the next file knows of its own only."""
+    told = {"0": None, "1": 0, "2": 7}
+    topics = {name: [mcap_files.Topic("/points", CLOUD_TYPE, n)] for name, n in told.items()}
+    monkeypatch.setattr(mcap_files, "_topics_of", lambda path: topics[path.name])
+
+    def counted(*names):
+        (topic,) = mcap_files.recorded_topics(tuple(tmp_path / name for name in names))
+        return topic.messages
+
+    assert counted("0", "1", "2") is counted("1", "0") is counted("2", "1", "0") is None
+    assert counted("1", "2", "2") == 14
 
 
 def test_messages_come_in_log_order_whatever_their_order_in_the_file(tmp_path):
@@ -304,6 +319,8 @@ def test_a_protocol_is_two_views_and_pairs_of_pixels():
         '{"views": [1, 2], "pairs": [{"a": [1, 2]}]}',
         '{"views": [1, -2], "pairs": []}',
         '{"views": [1, 2], "pairs": [{"a": [1.5, 2], "b": [1, 2]}]}',
+        '{"views": [1, 2], "pairs": [{"a": [1e400, 2], "b": [1, 2]}]}',
+        '{"views": [1, Infinity], "pairs": []}',
     ],
 )
 def test_a_bad_protocol_is_named(tmp_path, text):

@@ -144,6 +144,19 @@ def test_bad_files_are_named_with_what_is_wrong(tmp_path):
     refused("text.npy", None, "expected numbers")
     refused("nan.npy", None, "no measured points")
     refused("mm.npy", None, "give metres")
+    for k, line in enumerate((b"format", b"element vertex", b"property float", b"property")):
+        header = text.replace(b"element vertex", line + b"\nelement vertex", 1)
+        refused(f"words{k}.ply", header, "says too little")
+    refused("rows.ply", text.replace(b"vertex 4800", b"vertex -5"), "'-5' rows")
+    lists = text.replace(b"property float x", b"property list uchar int k\nproperty float x")
+    refused("lists.ply", lists, "property that is a list")
+    np.savez(tmp_path / "names.npz", xyz=np.ones((5, 3)), rgb=np.full((5, 3), "red"))
+    refused("names.npz", None, "colours are <U3")
+    plain = (tmp_path / "a.npy").read_bytes()
+    refused("header.npy", plain.replace(b"'shape': (5, 4)", b"'shape': (5, 4'"), "cannot be read")
+    huge = plain.replace(b"(5, 4), }      ", b"(999999999999, 4), }"[:15] + b"   ")
+    assert huge != plain
+    refused("huge.npy", huge, "cannot be read")
     refused("cut.npz", (tmp_path / "a.npz").read_bytes()[:50], "cannot be read")
 
 
@@ -155,6 +168,12 @@ def sheet_file(tmp_path, extra=None):
         colours = np.concatenate([colours, np.zeros((len(extra), 3), np.uint8)])
     np.savez(tmp_path / "sheet.npz", xyz=points, rgb=colours)
     return load_cloud_file(tmp_path / "sheet.npz")
+
+
+def test_points_where_no_camera_measures_are_none(tmp_path):
+    cloud = sheet_file(tmp_path, np.full((30, 3), 1e10))
+    assert np.isnan(cloud.xyz[0, -30:]).all()
+    np.testing.assert_allclose(cloud.xyz[0, :-30], sheet()[0].reshape(-1, 3), atol=1e-7)
 
 
 def test_a_view_of_a_cloud_stands_below_its_highest_point(tmp_path):

@@ -33,6 +33,10 @@ def test_an_empty_file_changes_nothing(tmp_path):
     assert load_config(written(tmp_path, "")) == Config()
 
 
+def test_an_empty_section_changes_nothing(tmp_path):
+    assert load_config(written(tmp_path, "rotation:\ngeodesics:\n")) == Config()
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -41,6 +45,7 @@ def test_an_empty_file_changes_nothing(tmp_path):
         ("- a\n- b", "expected settings"),
         ("a: [", "cannot be read as YAML"),
         ("method: magic", "method"),
+        ("rotation: {ros__parameters: 5}", "expected settings, name: value; got 5"),
     ],
 )
 def test_wrong_settings_name_the_file_and_the_trouble(tmp_path, text, says):
@@ -59,3 +64,28 @@ def test_the_settings_that_come_with_the_package_are_read():
     from vflatten_ros.resources import config_path
 
     assert load_config(config_path("vflatten.yaml")).method in ("rotation", "kita2019")
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes", "says"),
+    [
+        ("typical: 0.36", "typical: .inf", "sizes.waist_width"),
+        ("spread: 0.35", "spread: .nan", "sizes.waist_width"),
+        ("swing: 30", "swing: .nan", "swing: expected a number"),
+        ("swing: 30", "swing: -3", "swing: expected a number of 0 or more"),
+        ("spread: 3\n", "spread: -3\n", "spread: expected"),
+        ("angle: 2", "angle: .inf", "angle: expected"),
+        ("[crotch, waist_front]", "[crotch, crotch]", "measurements.rise: its path has no length"),
+        ("name: hip, at", "name: hip, prt: leg, at", "unknown key 'prt' of a point"),
+    ],
+)
+def test_a_category_that_cannot_be_is_refused_as_it_is_read(tmp_path, was, becomes, says):
+    from vflatten_ros.categories import load_templates
+    from vflatten_ros.resources import config_path
+
+    text = (config_path("categories") / "trousers.yaml").read_text()
+    assert was in text
+    (tmp_path / "trousers.yaml").write_text(text.replace(was, becomes, 1))
+    with pytest.raises(InvalidConfig, match=says) as caught:
+        load_templates(tmp_path)
+    assert "trousers" in str(caught.value)

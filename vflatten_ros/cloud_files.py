@@ -6,6 +6,7 @@ import dataclasses
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,17 @@ FRAME = "cloud_file"
 COLOUR_KEYS = ("rgb", "colors", "colours", "color")
 POINT_KEYS = ("xyz", "points", "arr_0")
 NEAREST_M = 0.05  # of the axis to the camera
+BROKEN = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    MemoryError,
+    SyntaxError,
+    TokenError,
+    zipfile.BadZipFile,
+)  # fmt: skip  what numpy's and zip files' readers raise
+FARTHEST_M = 1e4  # beyond, no camera has measured anything
 LARGEST_M = 20.0  # clouds of indoor cameras stay below; millimetres do not
 
 
@@ -58,7 +70,7 @@ def load_cloud_file(path: str | Path) -> Cloud:
         raise InvalidCloud(f"{path}: no such file") from error
     except InvalidCloud as error:
         raise InvalidCloud(f"{path}: {error}") from error
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except BROKEN as error:
         reason = " ".join(str(error).split())
         raise InvalidCloud(f"{path}: cannot be read ({reason}); is it complete?") from error
 
@@ -184,9 +196,11 @@ def _cloud(xyz: NDArray[Any], rgb: NDArray[Any] | None) -> Cloud:
     points[bad] = np.nan
     if bad.all():
         raise InvalidCloud("no measured points")
-    largest = float(np.median(np.abs(points[~bad]).max(axis=1)))
+    away = np.where(bad, 0.0, np.abs(np.where(bad[..., None], 0.0, points)).max(axis=2))
+    largest = float(np.median(away[~bad]))
     if largest > LARGEST_M:
         raise InvalidCloud(f"half of the points are {largest:.0f} m away or more; give metres")
+    points[away > FARTHEST_M] = np.nan
     cloud = Cloud(0, FRAME, points, None)
     return cloud if rgb is None else dataclasses.replace(cloud, rgb=_colours(rgb, points.shape))
 
@@ -194,6 +208,8 @@ def _cloud(xyz: NDArray[Any], rgb: NDArray[Any] | None) -> Cloud:
 def _colours(rgb: NDArray[Any], shape: tuple[int, ...]) -> Byte:
     if rgb.size != np.prod(shape):
         raise InvalidCloud(f"{rgb.size // 3} colours for {shape[0] * shape[1]} points")
+    if rgb.dtype.kind not in "biuf":
+        raise InvalidCloud(f"colours are {rgb.dtype}; expected numbers")
     values = rgb.reshape(shape)
     if values.dtype == np.uint16:
         values = values >> 8

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -17,6 +18,7 @@ from vflatten_ros.core.values import Calibration, Correspondence
 from vflatten_ros.parameters import entries
 
 CALIBRATION_NAME = "calibration.yaml"
+SECTIONS = {name.split(".")[0] for name in flatten_config(Config()) if "." in name}
 
 
 def calibration_beside(recording: str | Path) -> Path:
@@ -102,7 +104,10 @@ def load_config(path: str | Path) -> Config:
         raise InvalidConfig(f"{path}: cannot be read as YAML: {_one_line(error)}") from error
     if not isinstance(values, Mapping):
         raise InvalidConfig(f"{path}: expected settings, name: value; got {type(values).__name__}")
-    given = dict(_settings(values))
+    try:
+        given = dict(_settings(values))
+    except InvalidConfig as error:
+        raise InvalidConfig(f"{path}: {error}") from error
     core = flatten_config(Config())
     known = set(core) | {entry.name for entry in entries()} | {"use_sim_time"}
     unknown = sorted(set(given) - known)
@@ -120,17 +125,27 @@ def _settings(values: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str
     """Nested settings as 'section.name', value; the levels of node names are left out."""
     for key, value in values.items():
         if isinstance(value, Mapping) and "ros__parameters" in value:
-            yield from _settings(value["ros__parameters"] or {})
+            yield from _settings(_section(value["ros__parameters"]))
         elif key == "ros__parameters":
-            yield from _settings(value or {})
+            yield from _settings(_section(value))
+        elif value is None and not prefix and key in SECTIONS:
+            continue  # nothing is set in it
         elif isinstance(value, Mapping):
             yield from _settings(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
 
 
+def _section(value: Any) -> Mapping[Any, Any]:
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise InvalidConfig(f"ros__parameters: expected settings, name: value; got {value!r}")
+    return value
+
+
 def _whole(value: Any) -> int:
-    if isinstance(value, bool) or int(value) != value or value < 0:
+    if isinstance(value, bool) or not math.isfinite(value) or int(value) != value or value < 0:
         raise ValueError(f"{value!r}, expected a whole number")
     return int(value)
 

@@ -81,8 +81,10 @@ def recorded_topics(files: tuple[Path, ...]) -> tuple[Topic, ...]:
     for path in files:
         for topic in _topics_of(path):
             before = found.get(topic.name)
-            if before is not None and before.messages is not None and topic.messages is not None:
-                topic = Topic(topic.name, topic.kind, before.messages + topic.messages)
+            if before is not None:
+                counts = before.messages, topic.messages
+                total = None if None in counts else sum(count or 0 for count in counts)
+                topic = Topic(topic.name, topic.kind, total)
             found[topic.name] = topic
     return tuple(found[name] for name in sorted(found))
 

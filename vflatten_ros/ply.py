@@ -21,6 +21,7 @@ TYPES = {
 }  # fmt: skip
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 LONGEST_HEADER = 1000  # lines
+NEEDED = {"format": 2, "element": 3, "property": 3}  # words of such a line
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,13 @@ def _read_header(stream: BinaryIO) -> _Header:
         words = line.decode("latin-1").split()
         if not line or words[:1] == ["end_header"]:
             break
+        if len(words) < NEEDED.get(words[0] if words else "", 0):
+            raise InvalidCloud(f"the .ply header is damaged: {' '.join(words)!r} says too little")
         if words[:1] == ["format"]:
             encoding = words[1]
         elif words[:1] == ["element"]:
+            if not words[2].isdigit():
+                raise InvalidCloud(f"the .ply header has {words[2]!r} rows of {words[1]!r}")
             elements.append(_Element(words[1], int(words[2]), ()))
         elif words[:1] == ["property"] and elements:
             last = elements.pop()
@@ -104,6 +109,8 @@ def _read_elements(stream: BinaryIO, header: _Header) -> dict[str, dict[str, NDA
     tables: dict[str, dict[str, NDArray[Any]]] = {}
     for element in header.elements:
         if any(kind == "list" for _, kind in element.columns):
+            if element.name == "vertex":
+                raise InvalidCloud("the vertices have a property that is a list: write plain ones")
             if "vertex" not in tables:
                 raise InvalidCloud(f"element {element.name!r} with lists comes before the vertices")
             break

@@ -32,6 +32,7 @@ _KEYS = {
     "measurements",
     "order",
 }
+_POINT_KEYS = {"at", "bend", "name", "open", "part"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +230,14 @@ def _template(data: Mapping[str, Any]) -> Template:
         ) from error
 
 
+def _number(part: Mapping[str, Any], key: str, low: float = -np.inf) -> float:
+    value = float(part[key])
+    if not (np.isfinite(value) and value >= low):
+        least = "" if low == -np.inf else f" of {low:g} or more"
+        raise InvalidConfig(f"parts: {key}: expected a number{least}, got {value}")
+    return value
+
+
 class _Reader:
     """Turns one description into arrays."""
 
@@ -259,6 +268,8 @@ class _Reader:
             if size not in paths:
                 raise InvalidConfig(f"measurements.{size} is missing")
         order = tuple(self.data.get("order") or ())
+        if len(set(order)) < len(order):
+            raise InvalidConfig(f"order names a measurement twice: {order}")
         if not set(order) <= set(paths):
             raise InvalidConfig(f"order names a measurement that is not there: {order}")
         parts = [self.data["parts"][p] for p in self.parts]
@@ -272,9 +283,9 @@ class _Reader:
             helpers=len(self.names) - named,
             log_typical=log_typical,
             log_spread=log_spread,
-            angle=np.radians([float(p["angle"]) for p in parts]),
-            spread=np.radians([float(p["spread"]) for p in parts]),
-            swing=np.radians([float(p["swing"]) for p in parts]),
+            angle=np.radians([_number(p, "angle") for p in parts]),
+            spread=np.radians([_number(p, "spread", 0.0) for p in parts]),
+            swing=np.radians([_number(p, "swing", 0.0) for p in parts]),
             fixed=np.array(fixed),
             turned=np.array(turned),
             part=np.array(part, dtype=np.int64),
@@ -285,7 +296,11 @@ class _Reader:
             seam=self.seam(),
             single_sheet=self.single_sheet(),
         )
-        _check_outline(template.outline(np.zeros(template.dimensions)))
+        rest = np.zeros(template.dimensions)
+        _check_outline(template.outline(rest))
+        for measured, (metres, _) in template.measure(rest, np.eye(template.dimensions)).items():
+            if not metres > 0.0:
+                raise InvalidConfig(f"measurements.{measured}: its path has no length")
         return template
 
     def single_sheet(self) -> bool:
@@ -309,7 +324,7 @@ class _Reader:
         for i, name in enumerate(self.sizes):
             size = self.data["sizes"][name]
             value, width = float(size["typical"]), float(size["spread"])
-            if not (value > 0.0 and width > 0.0):
+            if not (0.0 < value < np.inf and 0.0 < width < np.inf):
                 raise InvalidConfig(f"sizes.{name}: typical and spread must be > 0, got {size}")
             typical[i], spread[i, i] = np.log(value), width
             if size.get("of") is not None:
@@ -353,6 +368,10 @@ class _Reader:
         self.rows.append((*row, side))
 
     def point(self, point: Mapping[str, Any]) -> tuple[Float, Float, int, bool]:
+        unknown = sorted(set(point) - _POINT_KEYS)
+        if unknown:
+            keys = ", ".join(sorted(_POINT_KEYS))
+            raise InvalidConfig(f"unknown key {unknown[0]!r} of a point; known are {keys}")
         at = np.array([self.sum(value) for value in point["at"]])
         if at.shape != (2, len(self.sizes)):
             raise InvalidConfig(f"at: expected [u, v], got {point['at']!r}")

@@ -126,6 +126,16 @@ def test_a_pixel_just_off_the_edge_moves_onto_the_item():
     row = int(np.median(view.pixel[:, 0]))
     edge = int(view.pixel[view.pixel[:, 0] == row, 1].min())
     assert messages.pixel_on_item(view, (row, edge - 2)) == (row, edge)
+    assert messages.pixel_on_item(view, (row, edge - 9), reach_px=10.0) == (row, edge)
+    with pytest.raises(InvalidCorrespondence, match="not on the item"):
+        messages.pixel_on_item(view, (row, edge - 9))
+
+
+@pytest.mark.parametrize("row", [2**32 + 77, 10**12, -(2**40)])
+def test_a_pixel_beyond_any_image_does_not_come_round(row):
+    pair = replace(GARMENT.correspondences[0], pixel_a=(row, 80))
+    with pytest.raises(InvalidCorrespondence, match=str(row)):
+        messages.checked_correspondence(pair, BY_ID)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from vflatten_ros.core.buffer import BufferState
+from vflatten_ros.core.config import IntegrationConfig
 from vflatten_ros.core.errors import InvalidCorrespondence
 from vflatten_ros.core.values import (
     Correspondence,
@@ -36,7 +37,7 @@ PIXEL, POINT = 0, 1  # Correspondence.given_a, given_b
 
 UNSEEN_NOTHING, UNSEEN_TURN, UNSEEN_REGRASP = 0, 1, 2  # GarmentEstimate.unseen
 
-PIXEL_REACH = 3.0  # pixels; a pixel given by hand may miss the item's edge by this much
+MOST_PIXEL = 2**31 - 1  # that the message holds
 POINT_REACH_M = 0.02  # a point given by hand may miss the surface by this much
 
 
@@ -246,18 +247,22 @@ def correspondence_fields(
 
 
 def correspondence_from_fields(
-    fields: Mapping[str, Any], views: Mapping[int, View]
+    fields: Mapping[str, Any],
+    views: Mapping[int, View],
+    reach_px: float = IntegrationConfig().pair_reach_px,
 ) -> Correspondence:
     """The core's correspondence from vflatten_ros/Correspondence fields.
 
     A side given by POINT becomes the nearest pixel of its view; a side given by PIXEL moves to the
-    item's nearest pixel if it misses the item's edge by no more than three pixels.
+    item's nearest pixel if it misses the item's edge by no more than `reach_px`.
 
     Parameters
     ----------
     fields : mapping
         As `correspondence_fields` gives them, or `read(message)`.
     views : mapping of view id to View
+    reach_px : float
+        The setting integration.pair_reach_px.
 
     Raises
     ------
@@ -270,18 +275,31 @@ def correspondence_from_fields(
     confidence = float(fields.get("confidence", 1.0))
     if not 0.0 <= confidence <= 1.0:
         raise InvalidCorrespondence(f"confidence: expected 0 to 1, got {confidence}")
-    pixel_a, pixel_b = (_side(fields, side, views, i) for side, i in zip("ab", ids, strict=True))
+    pixel_a, pixel_b = (
+        _side(fields, side, views, i, reach_px) for side, i in zip("ab", ids, strict=True)
+    )
     manual = int(fields.get("origin", MANUAL)) == MANUAL
     return Correspondence(ids[0], ids[1], pixel_a, pixel_b, manual, confidence)
 
 
-def checked_correspondence(pair: Correspondence, views: Mapping[int, View]) -> Correspondence:
+def checked_correspondence(
+    pair: Correspondence,
+    views: Mapping[int, View],
+    reach_px: float = IntegrationConfig().pair_reach_px,
+) -> Correspondence:
     """The pair as the service would take it; raises InvalidCorrespondence as it would."""
-    return correspondence_from_fields(correspondence_fields(pair, 0), views)
+    for pixel in (pair.pixel_a, pair.pixel_b):
+        if max(abs(int(place)) for place in pixel) > MOST_PIXEL:
+            row, col = pixel
+            raise InvalidCorrespondence(
+                f"pixel (row {row}, col {col}): no image is so large; pixels are given as row, col "
+                "from 0"
+            )
+    return correspondence_from_fields(correspondence_fields(pair, 0), views, reach_px)
 
 
 def _side(
-    fields: Mapping[str, Any], side: str, views: Mapping[int, View], view_id: int
+    fields: Mapping[str, Any], side: str, views: Mapping[int, View], view_id: int, reach_px: float
 ) -> tuple[int, int]:
     if view_id not in views:
         known = ", ".join(str(i) for i in sorted(views)) or "none"
@@ -292,12 +310,14 @@ def _side(
         return _pixel_of_point(views[view_id], np.array([point[k] for k in "xyz"], dtype=float))
     if given == PIXEL:
         row, col = (int(v) for v in fields[f"pixel_{side}"])
-        return pixel_on_item(views[view_id], (row, col))
+        return pixel_on_item(views[view_id], (row, col), reach_px)
     raise InvalidCorrespondence(f"given_{side}: expected PIXEL (0) or POINT (1), got {given}")
 
 
-def pixel_on_item(view: View, pixel: tuple[int, int]) -> tuple[int, int]:
-    """The item's pixel nearest to `pixel` (row, col); InvalidCorrespondence beyond three pixels."""
+def pixel_on_item(
+    view: View, pixel: tuple[int, int], reach_px: float = IntegrationConfig().pair_reach_px
+) -> tuple[int, int]:
+    """The item's pixel nearest to `pixel` (row, col); InvalidCorrespondence beyond the reach."""
     rows, cols = view.shape
     if not (0 <= pixel[0] < rows and 0 <= pixel[1] < cols):
         raise InvalidCorrespondence(
@@ -306,7 +326,7 @@ def pixel_on_item(view: View, pixel: tuple[int, int]) -> tuple[int, int]:
         )
     away = view.pixel - np.array(pixel, dtype=view.pixel.dtype)
     gap = np.einsum("ij,ij->i", away, away)  # squared
-    if not len(gap) or gap.min() > PIXEL_REACH**2:
+    if not len(gap) or gap.min() > reach_px**2:
         nearest = f"{gap.min() ** 0.5:.0f} pixels away" if len(gap) else "nowhere"
         raise InvalidCorrespondence(
             f"pixel (row {pixel[0]}, col {pixel[1]}) of view {view.view_id} is not on the item, "

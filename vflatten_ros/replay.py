@@ -104,7 +104,7 @@ def replay_recording(
                 f"{path}: method rotation needs two views or more, got {len(views)}; use more of "
                 "them, or flatten what one view shows with --method kita2019"
             )
-        kept = _check_pairs(pairs, views, protocol, warn)
+        kept = _check_pairs(pairs, views, protocol, config.integration.pair_reach_px, warn)
         prepared = preparation.of(views, progress)
     garment = flatten_garment(views, kept, templates, config, progress, prepared, helper=helper)
     return Replayed(
@@ -206,6 +206,7 @@ def _check_pairs(
     pairs: Sequence[Correspondence],
     views: Sequence[View],
     protocol: Path | None,
+    reach_px: float,
     warn: Callable[[str], None],
 ) -> tuple[Correspondence, ...]:
     """The corresponding points that lie on the item; InvalidCorrespondence if they are too few."""
@@ -214,7 +215,7 @@ def _check_pairs(
     refused: list[str] = []
     for number, pair in enumerate(pairs):
         try:
-            kept.append(checked_correspondence(pair, by_id))
+            kept.append(checked_correspondence(pair, by_id, reach_px))
         except InvalidCorrespondence as error:
             refused.append(f"corresponding point {number} left out: {error}")
     if protocol is not None and len(kept) < FEWEST_PAIRS:

@@ -190,8 +190,9 @@ class Session:
     ) -> tuple[int, str]:
         if len(self.pairs) >= MAX_PAIRS:
             return 0, f"there are {MAX_PAIRS} pairs already; clear some"
+        reach_px = self.buffer.config.integration.pair_reach_px
         try:
-            pair = messages.correspondence_from_fields(fields, views)
+            pair = messages.correspondence_from_fields(fields, views, reach_px)
         except InvalidCorrespondence as error:
             return 0, str(error)
         if _places(pair) in held:

@@ -93,6 +93,11 @@ class ViewBuffer:
         self._outdated: tuple[int, int] | None = None  # stamps from, received until
         self._begin_item()
 
+    @property
+    def config(self) -> Config:
+        """The settings in use."""
+        return self._config
+
     def configure(self, config: Config) -> None:
         """Use other settings from now on; views and joint states so far stay."""
         self._fingers.configure(config.buffer)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from vflatten_ros import resources, threads
 from vflatten_ros.core.config import METHODS, Config
-from vflatten_ros.core.errors import VFlattenError
+from vflatten_ros.core.errors import InvalidInput, VFlattenError
 from vflatten_ros.helper import helper_for
 from vflatten_ros.progress import Stages
 
@@ -137,7 +137,11 @@ def _add_recorded(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--method", choices=METHODS, help="default: the settings' method")
+    parser.add_argument(
+        "--method",
+        choices=METHODS,
+        help="default: kita2019 for one cloud and with --protocol, else the settings' method",
+    )
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="settings, as config/vflatten.yaml"
     )
@@ -174,6 +178,11 @@ def _flatten(args: argparse.Namespace) -> None:
     from vflatten_ros.replay import flatten_file
 
     _prepare_outputs(args)
+    if args.method == "rotation":
+        raise InvalidInput(
+            "--method rotation: one cloud is no rotation; leave the option away, or replay a "
+            "recording"
+        )
     config = _config(args, "kita2019")
     with Stages(_show_bar(args)) as stages:
         replayed = flatten_file(args.cloud, config, up=args.up, crop=args.crop, progress=stages)

@@ -148,6 +148,8 @@ class HelperProcess:
         environment = dict(os.environ)
         keep_little(environment)
         code = (
+            # from the first statement on: Ctrl-C reaches the group, and the caller decides
+            "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
             f"import sys; sys.path[:] = {sys.path!r}\n"
             f"from vflatten_ros.helper import serve; serve({theirs.fileno()})"
         )

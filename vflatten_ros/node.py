@@ -110,10 +110,14 @@ def main(
         0 after SIGINT, SIGTERM or a shutdown, 1 where a parameter is wrong.
     """
     transport.use_profile()
-    rclpy.init(
-        args=[sys.argv[0], *_ros_arguments(sys.argv[1:] if argv is None else argv)],
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
+    try:
+        rclpy.init(
+            args=[sys.argv[0], *_ros_arguments(sys.argv[1:] if argv is None else argv)],
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except RuntimeError as error:  # of rcl, which parses the arguments
+        print(f"vflatten node: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
     end_asked = EndAsked()
     try:
         node = FlattenNode(loader=loader)

@@ -63,7 +63,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 0.0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
     return value
@@ -193,7 +196,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     transport.use_profile()
     # rclpy's handlers shut the context down from another thread, perhaps while it is published
-    rclpy.init(args=given[at:], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=given[at:], signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # of rcl, which parses the arguments
+        print(f"vflatten play: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as SIGINT
     node = Node("vflatten_player")
     try:

@@ -311,6 +311,16 @@ def test_the_same_bytes_on_one_thread_and_without_views_prepared_before(monkeypa
     assert json_text(garment_result(again, before.views)) == first
 
 
+def test_views_are_taken_as_they_came_however_they_are_named():
+    few = (0, 4, 8)
+    first, again = (
+        replay_recording(BAGS / "SK2_1", ALL_VIEWS, view_ids=ids) for ids in (few, few[::-1])
+    )
+    assert json_text(garment_result(again.garment, again.views)) == json_text(
+        garment_result(first.garment, first.views)
+    )
+
+
 @pytest.mark.slow
 def test_sizes_are_as_uncertain_as_where_parts_lie_and_as_a_bad_fit_makes_them(monkeypatch):
     monkeypatch.setattr(tried.Tried, "apart_sigma_m", 0.03)

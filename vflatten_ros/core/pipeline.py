@@ -105,6 +105,7 @@ def flatten_garment(
         raise NotEnoughViews("no views to flatten")
     done = prepared or {}
     if config.method == "rotation":
+        views = sorted(views, key=lambda view: view.view_id)  # as they came, however they are named
         flattened, settled = _rotation(
             views, correspondences, templates, config, progress, done, so_far, helper
         )

@@ -209,6 +209,12 @@ def test_flatten_takes_one_cloud(tmp_path):
     assert 0.99 < apart_flat / apart < 1.33
 
 
+def test_one_cloud_is_no_rotation(tmp_path):
+    np.savez(tmp_path / "cloud.npz", xyz=np.ones((9, 9, 3), np.float32))
+    run = vflatten("flatten", tmp_path / "cloud.npz", "--method", "rotation")
+    assert_one_line(run, "one cloud is no rotation")
+
+
 def assert_one_line(run, *parts):
     assert run.returncode == 1
     assert run.stdout == ""

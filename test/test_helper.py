@@ -195,6 +195,13 @@ def test_it_gives_memory_back(helper):
     assert {f"{name}={value}".encode() for name, value in SETTINGS.items()} <= set(environment)
 
 
+def test_what_interrupts_its_caller_does_not_reach_it():
+    """Ctrl-C goes to the process group of the terminal, from the first moment on."""
+    with HelperProcess() as another:
+        assert os.getpgid(another.pid) != os.getpgid(0)
+        assert os.getsid(another.pid) != os.getsid(0)
+
+
 def test_it_ends_with_its_caller():
     code = (
         "import time\nfrom vflatten_ros.helper import HelperProcess\n"

@@ -25,7 +25,7 @@ from vflatten_ros.progress import Stages
 if TYPE_CHECKING:
     from vflatten_ros.replay import Replayed
 
-OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+OK, FAILED, INTERRUPTED = 0, 1, 130
 PASSED_ON = {"node": "vflatten_ros.node", "play": "vflatten_ros.player"}
 
 

@@ -148,8 +148,6 @@ class HelperProcess:
         environment = dict(os.environ)
         keep_little(environment)
         code = (
-            # from the first statement on: Ctrl-C reaches the group, and the caller decides
-            "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
             f"import sys; sys.path[:] = {sys.path!r}\n"
             f"from vflatten_ros.helper import serve; serve({theirs.fileno()})"
         )
@@ -161,6 +159,7 @@ class HelperProcess:
             stdin=subprocess.DEVNULL,
             pass_fds=[theirs.fileno()],
             env=environment,
+            start_new_session=True,  # Ctrl-C reaches the group of a terminal: the caller decides
         )
         theirs.close()
         threading.Thread(target=self._write, args=(ours, self._outbox), daemon=True).start()
@@ -307,7 +306,6 @@ class _Inbox:
 
 def serve(handle: int) -> None:
     """What the process runs: take tasks until the other end of the pipe is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the group; the caller decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     pipe = Connection(handle)
     inbox = _Inbox(pipe)

@@ -37,7 +37,7 @@ PIXEL, POINT = 0, 1  # Correspondence.given_a, given_b
 
 UNSEEN_NOTHING, UNSEEN_TURN, UNSEEN_REGRASP = 0, 1, 2  # GarmentEstimate.unseen
 
-MOST_PIXEL = 2**31 - 1  # that the message holds
+PIXEL_REACH = IntegrationConfig().pair_reach_px
 POINT_REACH_M = 0.02  # a point given by hand may miss the surface by this much
 
 
@@ -76,11 +76,6 @@ def angles_of(garment: FlatGarment, views: Iterable[View]) -> Float:
     """Item angle of each view used, radians; NaN for a view that is not among `views`."""
     known = {view.view_id: view.angle_rad for view in views}
     return np.array([known.get(i, np.nan) for i in garment.view_ids], dtype=np.float64)
-
-
-def is_trusted(garment: FlatGarment) -> bool:
-    """Whether a result may be used for sizes."""
-    return all(notice.code != "untrusted" for notice in garment.notices)
 
 
 def flattened_view_fields(garment: FlatGarment, views: Sequence[View], item: int = 0) -> Fields:
@@ -133,7 +128,7 @@ def garment_estimate_fields(garment: FlatGarment, views: Sequence[View], item: i
         "enough": bool(garment.enough),
         "unseen": _unseen_kind(garment),
         "turn_to": _turn_to(garment),
-        "trusted": is_trusted(garment),
+        "trusted": garment.trusted,
         **_notice_fields(garment),
     }
 
@@ -249,7 +244,7 @@ def correspondence_fields(
 def correspondence_from_fields(
     fields: Mapping[str, Any],
     views: Mapping[int, View],
-    reach_px: float = IntegrationConfig().pair_reach_px,
+    reach_px: float = PIXEL_REACH,
 ) -> Correspondence:
     """The core's correspondence from vflatten_ros/Correspondence fields.
 
@@ -285,17 +280,18 @@ def correspondence_from_fields(
 def checked_correspondence(
     pair: Correspondence,
     views: Mapping[int, View],
-    reach_px: float = IntegrationConfig().pair_reach_px,
+    reach_px: float = PIXEL_REACH,
 ) -> Correspondence:
     """The pair as the service would take it; raises InvalidCorrespondence as it would."""
-    for pixel in (pair.pixel_a, pair.pixel_b):
-        if max(abs(int(place)) for place in pixel) > MOST_PIXEL:
-            row, col = pixel
-            raise InvalidCorrespondence(
-                f"pixel (row {row}, col {col}): no image is so large; pixels are given as row, col "
-                "from 0"
-            )
-    return correspondence_from_fields(correspondence_fields(pair, 0), views, reach_px)
+    fields = {
+        "view_a": pair.view_a,
+        "view_b": pair.view_b,
+        "pixel_a": pair.pixel_a,  # as given: in a message's array a huge one would come round
+        "pixel_b": pair.pixel_b,
+        "origin": MANUAL if pair.manual else AUTOMATIC,
+        "confidence": pair.confidence,
+    }
+    return correspondence_from_fields(fields, views, reach_px)
 
 
 def _side(
@@ -315,7 +311,7 @@ def _side(
 
 
 def pixel_on_item(
-    view: View, pixel: tuple[int, int], reach_px: float = IntegrationConfig().pair_reach_px
+    view: View, pixel: tuple[int, int], reach_px: float = PIXEL_REACH
 ) -> tuple[int, int]:
     """The item's pixel nearest to `pixel` (row, col); InvalidCorrespondence beyond the reach."""
     rows, cols = view.shape

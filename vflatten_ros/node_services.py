@@ -235,7 +235,7 @@ class Services:
         response.position = messages.fill(PointStamped(), fields)
         response.sigma = float(mark.xyz_sigma_m)
         response.certainty = float(mark.certainty)
-        response.trusted = messages.is_trusted(garment)
+        response.trusted = garment.trusted
         response.views = list(mark.views)
         if not mark.seen:
             raise Refused(NOT_SEEN, f"{unseen}; the position is the nearest cloth that one shows")

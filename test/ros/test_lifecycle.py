@@ -51,6 +51,16 @@ def bring(rig, state):
         assert change(rig, transition)
 
 
+def active_in_silence(rig, setting, clouds):
+    """With one setting changed and nobody publishing, until the node has said so."""
+    bring(rig, UNCONFIGURED)
+    rig.set_parameter("calibration.file", str(CALIBRATION))
+    for name, value in (setting, ("no_data_warning_s", 0.5)):
+        assert rig.set_parameter(name, value).successful
+    bring(rig, ACTIVE)
+    rig.until(lambda: f"no cloud on {rig.namespace}/{clouds}" in rig.node.log(), "a warning")
+
+
 def test_every_transition_in_every_state_gets_an_answer(rig):
     rig.until(lambda: rig.lifecycle_state() == UNCONFIGURED, "the node")
     assert rig.set_parameter("calibration.file", str(CALIBRATION)).successful
@@ -162,12 +172,7 @@ def test_parameters_are_described_and_changes_refused_with_a_reason(rig):
 
 
 def test_a_publisher_that_cannot_reach_the_node_is_named_with_the_remedy(rig):
-    bring(rig, UNCONFIGURED)
-    rig.set_parameter("calibration.file", str(CALIBRATION))
-    assert rig.set_parameter("joint_states.reliability", "reliable").successful
-    assert rig.set_parameter("no_data_warning_s", 0.5).successful
-    bring(rig, ACTIVE)
-    rig.until(lambda: f"no cloud on {rig.namespace}/rig/points" in rig.node.log(), "a warning")
+    active_in_silence(rig, ("joint_states.reliability", "reliable"), "rig/points")
     publishers = [
         rig.planner.create_publisher(
             JointState, "gripper/joint_states", rclpy.qos.qos_profile_sensor_data
@@ -186,12 +191,7 @@ def test_a_publisher_that_cannot_reach_the_node_is_named_with_the_remedy(rig):
 
 
 def test_a_topic_of_another_type_is_told_with_the_type(rig):
-    bring(rig, UNCONFIGURED)
-    rig.set_parameter("calibration.file", str(CALIBRATION))
-    assert rig.set_parameter("clouds.topic", "somewhere").successful
-    assert rig.set_parameter("no_data_warning_s", 0.5).successful
-    bring(rig, ACTIVE)
-    rig.until(lambda: f"no cloud on {rig.namespace}/somewhere" in rig.node.log(), "a warning")
+    active_in_silence(rig, ("clouds.topic", "somewhere"), "somewhere")
     publisher = rig.planner.create_publisher(JointState, "somewhere", 1)
     found = f"{rig.namespace}/somewhere is published as sensor_msgs/msg/JointState, expected"
     rig.until(lambda: found in rig.node.log(), "the type")
@@ -356,6 +356,8 @@ def test_settings_of_the_flattening_process_count_until_the_activation(ros, tmp_
         (["--ros-args", "-p", "method:=5"], 1, "method"),
         (["--ros-args", "-p", "buffer.max_views:=5"], 1, "buffer.min_views 6"),
         (["--nonsense"], 2, "--nonsense"),
+        (["--params-file", "nowhere.yaml"], 1, "nowhere.yaml"),
+        (["--params-file", "README.md"], 1, "README.md"),
     ],
 )
 def test_a_wrong_start_ends_with_one_line(tmp_path, arguments, code, reason):

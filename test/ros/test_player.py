@@ -116,6 +116,12 @@ def test_a_player_that_is_interrupted_says_so_by_its_exit_code(listener, tmp_pat
     assert "Traceback" not in player.log()
 
 
+def test_a_rate_that_is_no_number_is_wrong_usage(tmp_path):
+    player = Process(["-m", "vflatten_ros.player", "x", "--rate", "x"], tmp_path / "log")
+    assert player.wait() == 2
+    assert "--rate: expected a number above 0, got x" in player.log()
+
+
 def test_a_recording_that_is_not_there_ends_with_one_line(tmp_path):
     player = Process(["-m", "vflatten_ros.player", str(tmp_path / "none")], tmp_path / "log")
     assert player.wait() == 1

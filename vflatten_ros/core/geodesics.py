@@ -18,7 +18,6 @@ from vflatten_ros.core.surface import Surface, depth_at
 from vflatten_ros.core.values import Bool, Float, Int, Progress, no_progress
 
 OK, JUMP, MISSING, BENT, NOT_CONVERGED = range(5)
-REASONS = ("ok", "jump", "missing data", "bent", "not converged")
 STEPS = 20  # of Gauss-Newton; lines on cloth need 3 to 8
 FINE = 4  # samples a node interval when a line is measured
 CORNER = 1  # grid steps past the corner of a rim

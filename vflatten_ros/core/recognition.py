@@ -183,11 +183,6 @@ def _fitted_from(before: Fit, template: Template, evidence: Evidence) -> Fit:
     return finish(template, evidence, pose[best], states[best])
 
 
-def fit_template(template: Template, evidence: Evidence, config: RecognitionConfig) -> Fit:
-    """The best pose and cut of one category."""
-    return fit_templates((template,), evidence, config)[template.category]
-
-
 def fit_templates(
     templates: tuple[Template, ...],
     evidence: Evidence,

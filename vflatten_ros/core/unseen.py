@@ -178,5 +178,5 @@ def enough(garment: FlatGarment, config: ViewsConfig) -> bool:
         and garment.scores[garment.category] >= config.enough_probability
         and certain
         and (garment.unseen is None or garment.unseen.turn_to_rad is None)
-        and all(notice.code != "untrusted" for notice in garment.notices)
+        and garment.trusted
     )

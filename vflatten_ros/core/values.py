@@ -330,6 +330,11 @@ class FlatGarment:
     unseen: Unseen | None = None  # None: nothing that matters
     enough: bool = False  # further views would hardly change the answer
 
+    @property
+    def trusted(self) -> bool:
+        """Whether it may be used for sizes."""
+        return all(notice.code != "untrusted" for notice in self.notices)
+
     def measurement(self, name: str) -> Measurement | None:
         """The measurement of that name, None if it was not made."""
         return next((m for m in self.measurements if m.name == name), None)

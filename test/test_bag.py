@@ -20,7 +20,13 @@ from recordings import (
 )
 
 from vflatten_ros import mcap_files
-from vflatten_ros.bag import RecordedCloud, RecordedJoints, gather_views, open_recording
+from vflatten_ros.bag import (
+    RecordedCloud,
+    RecordedJoints,
+    Recording,
+    gather_views,
+    open_recording,
+)
 from vflatten_ros.core.calibration import calibration_from
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import (
@@ -92,6 +98,30 @@ def test_split_files_without_metadata_are_read_in_order_of_number(tmp_path):
     write_bag(folder, [messages[k * 34 : (k + 1) * 34] for k in range(12)])
     (folder / "metadata.yaml").unlink()
     assert contents(folder) == contents(write_mcap(tmp_path / "one.mcap", messages))
+
+
+@pytest.mark.parametrize("options", [{}, {"chunked": False}])
+def test_files_that_overlap_in_time_are_read_side_by_side(tmp_path, options):
+    """As where clouds and joint states were recorded by two processes."""
+    messages = in_log_order(turn())
+    both = [[m for m in messages if (m.kind == CLOUD_TYPE) == clouds] for clouds in (False, True)]
+    assert [len(part) for part in both] == [400, 8]
+    folder = write_bag(tmp_path / "split", both, **options)
+    assert contents(folder) == contents(write_mcap(tmp_path / "one.mcap", messages))
+
+
+def test_a_file_is_not_opened_before_its_first_message_is_due(tmp_path, monkeypatch):
+    messages = in_log_order(turn())
+    recording = open_recording(write_bag(tmp_path / "split", [messages[:200], messages[200:]]))
+    opened, read = [], Recording._messages_of
+    monkeypatch.setattr(
+        Recording, "_messages_of", lambda self, path: (opened.append(path), read(self, path))[1]
+    )
+    stream = recording.messages()
+    for _ in range(200):
+        next(stream)
+    assert opened == [recording.files[0]]
+    assert len(list(stream)) == len(messages) - 200 and opened == list(recording.files)
 
 
 def test_a_file_that_counts_nothing_leaves_the_count_of_all_unknown(tmp_path, monkeypatch):

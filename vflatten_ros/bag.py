@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from vflatten_ros.core.values import Calibration, Cloud, Progress, View, no_prog
 from vflatten_ros.mcap_files import (
     BROKEN,
     Topic,
+    first_log_ns,
     one_line,
     recorded_messages,
     recorded_topics,
@@ -72,10 +74,19 @@ class Recording:
     def messages(self) -> Iterator[RecordedCloud | RecordedJoints]:
         """Clouds and joint states in log order, read as they are asked for.
 
-        A file that ends early or is damaged gives what comes before, and a warning.
+        Files may overlap in time; each is opened once its first message is due. One that ends
+        early or is damaged gives what comes before, and a warning.
         """
-        for path in self.files:
-            yield from self._messages_of(path)
+        waiting = sorted((first_log_ns(path), k, path) for k, path in enumerate(self.files))
+        due: list[tuple[int, int, RecordedCloud | RecordedJoints, Iterator[Any]]] = []
+        while waiting or due:
+            while waiting and (not due or waiting[0][0] <= due[0][0]):
+                _, k, path = waiting.pop(0)
+                _put_next(due, k, self._messages_of(path))
+            if due:
+                _, k, message, rest = heapq.heappop(due)
+                yield message
+                _put_next(due, k, rest)
 
     def _messages_of(self, path: Path) -> Iterator[RecordedCloud | RecordedJoints]:
         decoders: dict[int, Any] = {}
@@ -108,6 +119,13 @@ class Recording:
                 unreadable += 1
         if unreadable:
             self.warnings.append(f"{path}: left out {unreadable} joint states that end early")
+
+
+def _put_next(heap: list[Any], number: int, messages: Iterator[Any]) -> None:
+    """Put the next message of a file, if there is one, into the heap of those that are due."""
+    for message in messages:
+        heapq.heappush(heap, (message.log_ns, number, message, messages))
+        return
 
 
 def open_recording(

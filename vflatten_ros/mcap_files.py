@@ -10,6 +10,7 @@ import yaml
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
+from mcap.summary import Summary
 
 from vflatten_ros.core.errors import InvalidRecording
 
@@ -89,12 +90,24 @@ def recorded_topics(files: tuple[Path, ...]) -> tuple[Topic, ...]:
     return tuple(found[name] for name in sorted(found))
 
 
-def _topics_of(path: Path) -> list[Topic]:
+def first_log_ns(path: Path) -> int:
+    """No message of a file was recorded earlier; 0 for a file that has no statistics."""
+    summary = _summary(path)
+    statistics = summary.statistics if summary is not None else None
+    return statistics.message_start_time if statistics is not None else 0
+
+
+def _summary(path: Path) -> Summary | None:
+    """What a file says of itself; None: nothing, as the recorder was killed, or it is damaged."""
     with path.open("rb") as stream:
         try:
-            summary = SeekingReader(stream).get_summary()
+            return SeekingReader(stream).get_summary()
         except BROKEN:
-            summary = None
+            return None
+
+
+def _topics_of(path: Path) -> list[Topic]:
+    summary = _summary(path)
     if summary is not None and summary.channels and summary.statistics is not None:
         counts = summary.statistics.channel_message_counts
         return [
@@ -122,16 +135,12 @@ def recorded_messages(
     path: Path, topics: tuple[str, ...]
 ) -> Iterator[tuple[Schema | None, Channel, Message]]:
     """Messages in log order by the file's index, or in file order where it has none."""
+    summary = _summary(path)
+    if summary is None or not summary.chunk_indexes:
+        yield from _streamed(path, topics)
+        return
     with path.open("rb") as stream:
-        reader = SeekingReader(stream, validate_crcs=True)
-        try:
-            summary = reader.get_summary()
-        except BROKEN:
-            summary = None
-        if summary is not None and summary.chunk_indexes:
-            yield from reader.iter_messages(topics=topics)
-            return
-    yield from _streamed(path, topics)
+        yield from SeekingReader(stream, validate_crcs=True).iter_messages(topics=topics)
 
 
 def _streamed(

@@ -11,6 +11,7 @@ from vflatten_ros.core.config import (
     METHODS,
     Checked,
     Config,
+    changed_section,
     config_from,
     flatten_config,
     option,
@@ -145,7 +146,7 @@ class CalibrationOptions(Checked):
         super().__post_init__()
         if self.joint_sign not in (1.0, -1.0):
             raise InvalidConfig(
-                f"calibration.joint_sign: expected +1 or -1, got {self.joint_sign:g}; "
+                f"joint_sign: expected +1 or -1, got {self.joint_sign:g}; "
                 "+1 where the item angle grows with the joint"
             )
 
@@ -230,16 +231,11 @@ class Settings:
         """The same with other values; raises InvalidConfig with the reason."""
         core_names = flatten_config(self.core)
         core = config_from({k: v for k, v in values.items() if k in core_names}, self.core)
-        sections_: dict[str, Any] = {}
-        for name, prefix, kind in node_sections():
-            own = {
-                f.name: values[prefix + f.name]
-                for f in dataclasses.fields(kind)
-                if prefix + f.name in values
-            }
-            if own:
-                sections_[name] = dataclasses.replace(getattr(self.node, name), **own)
-        return Settings(core, dataclasses.replace(self.node, **sections_))
+        node = {
+            name: changed_section(getattr(self.node, name), prefix, values)
+            for name, prefix, _ in node_sections()
+        }
+        return Settings(core, dataclasses.replace(self.node, **node))
 
 
 class Parameters:

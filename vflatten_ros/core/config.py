@@ -37,11 +37,11 @@ class Checked:
     def __post_init__(self) -> None:
         types = get_type_hints(type(self))
         for item in dataclasses.fields(self):
-            _check(type(self).__name__, item, types[item.name], getattr(self, item.name))
+            _check(item, types[item.name], getattr(self, item.name))
 
 
-def _check(section: str, item: dataclasses.Field[Any], kind: Any, value: Any) -> None:
-    name = f"{section}.{item.name}"
+def _check(item: dataclasses.Field[Any], kind: Any, value: Any) -> None:
+    name = item.name
     if kind is float and type(value) not in (float, int):
         raise InvalidConfig(f"{name}: expected a number, got {value!r}")
     if kind in (int, bool, str) and type(value) is not kind:
@@ -709,15 +709,31 @@ def config_from(values: Mapping[str, Any], base: Config | None = None) -> Config
     changed: dict[str, Any] = {}
     if "method" in given:
         changed["method"] = given["method"]
-    for name, kind in sections():
-        own = {
-            f.name: given[f"{name}.{f.name}"]
-            for f in dataclasses.fields(kind)
-            if f"{name}.{f.name}" in given
-        }
-        if own:
-            changed[name] = dataclasses.replace(getattr(base, name), **_as_floats(kind, own))
+    for name, _ in sections():
+        changed[name] = changed_section(getattr(base, name), f"{name}.", given)
     return dataclasses.replace(base, **changed)
+
+
+def changed_section(section: Section, prefix: str, values: Mapping[str, Any]) -> Section:
+    """A section with those of the values, named with the prefix, that are its own.
+
+    Raises
+    ------
+    InvalidConfig
+        As the section itself does of a value, with the prefix before its name.
+    """
+    names = [item.name for item in dataclasses.fields(section)]
+    own = {name: values[prefix + name] for name in names if prefix + name in values}
+    if not own:
+        return section
+    types = get_type_hints(type(section))
+    for name, value in own.items():
+        if types[name] is float and type(value) is int:
+            own[name] = float(value)
+    try:
+        return dataclasses.replace(section, **own)
+    except InvalidConfig as error:
+        raise InvalidConfig(f"{prefix}{error}") from error
 
 
 def _walk(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -726,8 +742,3 @@ def _walk(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield from _walk(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
-
-
-def _as_floats(kind: type[Checked], values: dict[str, Any]) -> dict[str, Any]:
-    types = get_type_hints(kind)
-    return {k: float(v) if types[k] is float and type(v) is int else v for k, v in values.items()}

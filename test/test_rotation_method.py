@@ -27,6 +27,7 @@ from vflatten_ros.core import (
 )
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import DisconnectedSurface, InvalidCalibration, NotEnoughViews
+from vflatten_ros.core.values import Correspondence
 from vflatten_ros.files import calibration_beside, load_calibration
 from vflatten_ros.replay import replay_recording
 from vflatten_ros.results import garment_result, json_text
@@ -319,6 +320,46 @@ def test_views_are_taken_as_they_came_however_they_are_named():
     assert json_text(garment_result(again.garment, again.views)) == json_text(
         garment_result(first.garment, first.views)
     )
+
+
+def thinned_out(view, rows):
+    """The view had it these points only."""
+    points, pixel = view.points_rig[rows], view.pixel[rows]
+    return dataclasses.replace(view, points_rig=points, pixel=pixel, rgb=None)
+
+
+def test_views_that_show_hardly_anything_are_left_out_and_named():
+    """As where somebody stands before the item."""
+    rig = load_calibration(calibration_beside(BAGS / "SK2_1"))
+    views = gather_views(open_recording(BAGS / "SK2_1"), rig, ALL_VIEWS).views()
+    shreds = np.arange(0, len(views[2].pixel), len(views[2].pixel) // 150)  # in no plane
+    bare = [thinned_out(views[2], shreds), thinned_out(views[6], slice(60))]
+    seen = [views[0], views[4], views[8]]
+    pairs = [
+        Correspondence(a.view_id, b.view_id, tuple(a.pixel[9]), tuple(b.pixel[9]))
+        for a, b in ((bare[1], seen[0]), (seen[0], seen[1]))
+    ]
+
+    def flat(views, pairs):
+        garment = pipeline.flatten_garment(views, pairs, load_templates(), ALL_VIEWS)
+        told = {}
+        for notice in garment.notices:
+            told.setdefault(notice.code, []).append(notice.text)
+        return garment, told
+
+    (garment, told), (without, told_without) = flat([*seen, *bare], pairs), flat(seen, pairs[1:])
+    (text,) = told.pop("view_left_out")
+    assert text.startswith("without views 2, 6: view 2: 9 of 151 points have 8 others around them")
+    assert "; view 6: 60 points on the item, expected 100; " in text
+    (rejected,) = told.pop("correspondence_rejected")
+    assert rejected == "a corresponding point in view 6, which is left out"
+    assert told == told_without
+    assert garment.points.uv.tobytes() == without.points.uv.tobytes()
+    assert garment.correspondences == without.correspondences == (pairs[1],)
+    assert garment.view_ids == without.view_ids == (0, 4, 8)
+    assert [share.view_id for share in garment.shares] == [0, 4, 8]
+    with pytest.raises(NotEnoughViews, match="view 2: "):
+        flat([seen[0], *bare], ())
 
 
 @pytest.mark.slow

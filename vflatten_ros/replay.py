@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from weakref import WeakKeyDictionary
@@ -175,11 +176,13 @@ class _Preparation:
             self._begun[view] = self._pool.submit(prepare_view, view, self._config)
 
     def of(self, views: Sequence[View], progress: Progress) -> dict[int, ViewSurface]:
-        """What flatten_garment takes; raises what preparing one of the views raised."""
+        """What flatten_garment takes: of views that show enough of the item."""
         prepared = {}
         for number, view in enumerate(views):
             progress("surface", number / len(views))
-            surface = self._begun[view].result()
+            surface = None
+            with suppress(NotEnoughViews):  # the method says it
+                surface = self._begun[view].result()
             if surface is not None:
                 prepared[view.view_id] = surface
         return prepared

@@ -11,6 +11,7 @@ import numpy as np
 from vflatten_ros.core.config import CorrespondenceConfig, IntegrationConfig, RotationConfig
 from vflatten_ros.core.correspondences import NOTHING_GIVEN, Judged, judged, place_view
 from vflatten_ros.core.edges import inside_edges, pixels_to_edge, with_rows
+from vflatten_ros.core.errors import NotEnoughViews
 from vflatten_ros.core.fat_edges import fat_px
 from vflatten_ros.core.fat_edges import notice_of as fat_notice
 from vflatten_ros.core.fusion import Points, Samples, fuse
@@ -40,6 +41,8 @@ from vflatten_ros.core.values import (
     View,
     no_progress,
 )
+
+FEWEST_VIEWS = 2  # of a rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +102,15 @@ def fuse_views(
     Raises
     ------
     NotEnoughViews
+        Fewer than two views show enough to be placed; if some do not, the others are used.
     DisconnectedSurface
         The points are too far apart to show a surface.
     """
     features = prints is not None and prints.features
     registered = _registered(views, config, progress, prepared or {}, features, so_far)
     surfaces, poses = registered.surfaces, registered.poses
+    by_id = {view.view_id: view for view in views}
+    views = [by_id[surface.view_id] for surface in surfaces]
     grain = typical([surface.grain for surface in surfaces])
     notices = registered.notices + notices_of(config, grain, registered.apart_m)
     config = suited(config, grain)
@@ -135,6 +141,7 @@ def fuse_views(
         slid = slide_m([(placed[i], placed[j]) for i, j in looked], prints)
     if prints is not None and slid is not None and slid > prints.slide_m:
         notices = (*notices, slide_notice(slid))
+    given, nowhere = _of_views_left(given, set(by_id) - {view.view_id for view in views})
     checked = judged(given, placed, limits or IntegrationConfig())
     sights = tuple(
         PlacedSight(surface.sight, pose)
@@ -150,8 +157,24 @@ def fuse_views(
         registered.calibration,
         sights,
         checked,
-        notices,
+        notices + nowhere,
     )
+
+
+def _of_views_left(
+    given: Sequence[Correspondence], left_out: set[int]
+) -> tuple[list[Correspondence], tuple[Notice, ...]]:
+    """Corresponding points without those in views that are left out, of which it tells."""
+    kept: list[Correspondence] = []
+    notices: list[Notice] = []
+    for pair in given:
+        gone = {pair.view_a, pair.view_b} & left_out
+        if gone:
+            text = f"a corresponding point in view {min(gone)}, which is left out"
+            notices.append(Notice("correspondence_rejected", text))
+        else:
+            kept.append(pair)
+    return kept, tuple(notices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,19 +201,35 @@ def _registered(
     """
     seen = list(views)
     rows: list[Int] = [np.arange(len(view.points_rig)) for view in views]
+    bare: dict[int, NotEnoughViews] = {}  # by view_id: what is said of one that shows too little
 
     def surface(view: View) -> ViewSurface:
         return prepared.get(view.view_id) or view_surface(view, config, features)
+
+    def of_all(surface: Callable[[View], ViewSurface]) -> tuple[list[ViewSurface], list[int]]:
+        """Surfaces of the views that have one, and which these are; the others are forgotten."""
+        nonlocal seen, rows
+        surfaces, kept = [], []
+        for k, made in enumerate(_each(surface, seen, progress)):
+            if isinstance(made, NotEnoughViews):
+                bare[seen[k].view_id] = made
+            else:
+                surfaces.append(made)
+                kept.append(k)
+        if bare and len(kept) < FEWEST_VIEWS:
+            raise next(iter(bare.values()))
+        seen, rows = [seen[k] for k in kept], [rows[k] for k in kept]
+        return surfaces, kept
 
     def anew(noise_m: float) -> tuple[list[ViewSurface], list[Float]]:
         def surface_again(view: View) -> ViewSurface:
             return view_surface(view, config, features, noise_m)
 
-        surfaces = _each(surface_again, seen, progress)
-        placed = Folded(tuple(surfaces), tuple(poses), turned.config)
+        surfaces, kept = of_all(surface_again)
+        placed = Folded(tuple(surfaces), tuple(poses[k] for k in kept), turned.config)
         return surfaces, register_views(surfaces, turned.config, progress, placed)
 
-    surfaces = _each(surface, seen, progress)
+    surfaces, _ = of_all(surface)
     poses = register_views(surfaces, config, progress, so_far)
     turned = as_they_turn(views[0].calibration, surfaces, poses, config, progress)
     poses = turned.poses
@@ -211,7 +250,16 @@ def _registered(
     pairs = zip(surfaces, rows, strict=True)
     surfaces = [replace(surface, index=of_view[surface.index]) for surface, of_view in pairs]
     poses = [turned.T_hanger_common @ pose for pose in poses]
+    if bare:
+        notices = (*notices, _left_out(bare))
     return _Registered(surfaces, poses, apart_m, turned.calibration, notices)
+
+
+def _left_out(bare: Mapping[int, NotEnoughViews]) -> Notice:
+    """Says which views were not used, and why."""
+    ids = ", ".join(str(i) for i in sorted(bare))
+    why = "; ".join(str(error) for error in bare.values())
+    return Notice("view_left_out", f"without {'views' if len(bare) > 1 else 'view'} {ids}: {why}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,10 +310,18 @@ def _told_by_all(
 
 def _each(
     surface: Callable[[View], ViewSurface], views: Sequence[View], progress: Progress
-) -> list[ViewSurface]:
+) -> list[ViewSurface | NotEnoughViews]:
+    """The surface of each view, or why it has none."""
+
+    def tried(view: View) -> ViewSurface | NotEnoughViews:
+        try:
+            return surface(view)
+        except NotEnoughViews as error:
+            return error
+
     progress("surface", 0.0)
-    surfaces: list[ViewSurface] = []
-    for each in mapped(surface, views):
+    surfaces: list[ViewSurface | NotEnoughViews] = []
+    for each in mapped(tried, views):
         surfaces.append(each)
         progress("surface", len(surfaces) / len(views))
     return surfaces

@@ -167,7 +167,8 @@ def _rotation(
     best = likeliest(fused, tuple(templates), config, progress, helper)
     config = replace(config, rotation=best.rotation)
     calibration = fused.calibration or views[0].calibration
-    about_axis = [replace(view, calibration=calibration) for view in views]
+    used = set(fused.view_ids.tolist())
+    about_axis = [replace(view, calibration=calibration) for view in views if view.view_id in used]
     del fused  # its points are many
     unfolded, found = best.unfolded, best.found
     # one cloth has no loose parts, and no slit that may come out

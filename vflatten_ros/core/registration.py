@@ -98,7 +98,7 @@ def view_surface(
     if len(points) < MIN_POINTS:
         raise NotEnoughViews(
             f"view {view.view_id}: {len(points)} points on the item, expected {MIN_POINTS}; "
-            "leave the view out or widen segmentation.radius_m"
+            "widen segmentation.radius_m if that cuts the item off"
         )
     camera = T_hanger_rig[:3, 3]
     grain = grain_of(points)

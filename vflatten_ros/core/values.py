@@ -293,6 +293,7 @@ NOTICE_CODES: Mapping[str, str] = {
     "looked_past": "points where other views see nothing were taken away",
     "fat_edges": "stereo has made edges wider: what it added was taken off",
     "views_misplaced": "the views do not fit together, or a print on the cloth says so",
+    "view_left_out": "a view shows too little of the item to be placed beside the others",
     "axis_off": "the item turned about another axis than the calibration has",
     "views_chosen": "which views the two-view method chose by itself",
     "high_stress": "the distances contradict each other more than noise explains",

@@ -33,7 +33,7 @@ from vflatten_ros.core.image_border import cut_off_now
 from vflatten_ros.core.values import Calibration, FlatGarment
 from vflatten_ros.files import load_calibration
 from vflatten_ros.frames import Frames
-from vflatten_ros.goals import Finished, Goals, Listener
+from vflatten_ros.goals import Finished, Goals, Listener, Task
 from vflatten_ros.node_inputs import Inputs
 from vflatten_ros.node_lifecycle import ACTIVE, INACTIVE, SUCCESS, AnsweringLifecycleNode
 from vflatten_ros.node_log import without_numbers
@@ -50,7 +50,7 @@ from vflatten_ros.node_outputs import (
 )
 from vflatten_ros.node_services import Services, summary
 from vflatten_ros.parameters import CalibrationOptions, NodeOptions, Parameters, Settings
-from vflatten_ros.session import NOT_ACTIVE, Refused, Session
+from vflatten_ros.session import BUSY, NOT_ACTIVE, Refused, Session
 from vflatten_ros.worker import Load, Worker
 
 TICK_S = 0.05
@@ -337,13 +337,17 @@ class FlattenNode(AnsweringLifecycleNode):
             self._submit_own()
 
     def _submit_own(self) -> None:
-        if self.goals is None:
-            return
         try:
             task = self.active_session().task(self.settings.core)
-        except Refused:
-            return
-        self.goals.submit(task, Listener(lambda stage, fraction: None, lambda outcome: None))
+            self.submit(task, Listener(lambda stage, fraction: None, lambda outcome: None))
+        except Refused as error:
+            self.note_refusal(error, "not flattened by itself")
+
+    def submit(self, task: Task, listener: Listener) -> None:
+        """Have a task done; raises Refused if too many wait."""
+        if self.goals is None or not self.goals.submit(task, listener):
+            most = self.settings.node.node.max_queued_goals
+            raise Refused(BUSY, f"{most} goals are waiting already; try again later")
 
     def _look_early(self) -> None:
         """Flatten what there is so far, if nothing else is being flattened."""
@@ -354,12 +358,12 @@ class FlattenNode(AnsweringLifecycleNode):
             self.session.looked()
             self._submit_own()
 
-    def note_refusal(self, error: Refused) -> None:
+    def note_refusal(self, error: Refused, what: str = "a goal was refused") -> None:
         """A request for a result that is not even begun leaves a line, too."""
         self._refused += 1
         self._last_refusal = _first_line(str(error))
-        text = f"a goal was refused: {error}"
-        self.log.warning(text, without_numbers(self._last_refusal), kind="refused")
+        text = f"{what}: {error}"
+        self.log.warning(text, without_numbers(_first_line(text)), kind="refused")
 
     def _on_worker(self) -> None:
         if self.goals is None:

@@ -23,7 +23,6 @@ from vflatten_ros.goals import Listener
 from vflatten_ros.msg import Correspondence, Status, ViewInfo
 from vflatten_ros.node_outputs import buffer_message, result_message
 from vflatten_ros.session import (
-    BUSY,
     CANCELLED,
     FAILED,
     INVALID_ARGUMENT,
@@ -272,9 +271,7 @@ class Services:
         task = self._session().task(node.settings.core, method, ids)
         future = Future()
         listener = Listener(on_progress, future.set_result)
-        if node.goals is None or not node.goals.submit(task, listener):
-            most = node.settings.node.node.max_queued_goals
-            raise Refused(BUSY, f"{most} goals are waiting already; try again later")
+        node.submit(task, listener)
         return Waiting(listener, future, task.item)
 
     async def _outcome(self, waiting: Waiting) -> Outcome:

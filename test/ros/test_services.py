@@ -117,6 +117,18 @@ def test_absurd_goals_end_with_their_code(turned):
     assert int(shown["refused"]) >= 6 and "no views" in shown["last refusal"]
 
 
+def test_a_rotation_that_cannot_be_flattened_by_itself_is_told(rig):
+    rig.set_parameter("auto_flatten", True)
+    half_ns = recorded()[len(recorded()) // 2].log_ns
+    rig.turn(keep=lambda message: message.log_ns < half_ns)
+    rig.until(lambda: len(rig.ask("list_views").views) > 5, "half of the views")
+    assert list(rig.ask("select_views", ids=[3]).selected) == [3]
+    rig.turn(keep=lambda message: message.log_ns >= half_ns)
+    reason = "not flattened by itself: method rotation needs two views or more, got 1"
+    rig.until(lambda: reason in rig.node.log(), "the reason")
+    assert "got 1" in rig.diagnostics()["flattening"]["last refusal"]
+
+
 def test_absurd_angles_and_frames_of_landmarks_are_refused(turned):
     assert turned.flatten().result.status.code == Status.OK
     for angle in (np.nan, np.inf, 1e300):

@@ -1,9 +1,11 @@
 """Recordings are read whatever their storage, and bad ones are refused in words."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
+import zstandard
 from recordings import (
     BAGS,
     CALIBRATION,
@@ -203,6 +205,13 @@ def test_a_recording_cut_before_its_first_message_is_refused(tmp_path, size):
     with pytest.raises(InvalidRecording, match=r"stub\.mcap") as refusal:
         gather(path)
     assert "\n" not in str(refusal.value)
+
+
+def test_messages_that_are_compressed_one_by_one_are_told_with_a_remedy(tmp_path):
+    squeeze = zstandard.ZstdCompressor().compress
+    messages = [dataclasses.replace(m, fields=squeeze(bytes(99))) for m in in_log_order(turn())]
+    with pytest.raises(InvalidRecording, match="compressed one by one; write the bag anew"):
+        gather(write_bag(tmp_path / "bag", [messages]))
 
 
 def test_damaged_bytes_end_the_recording_there(tmp_path):

@@ -324,7 +324,15 @@ def test_calibrations_that_describe_no_rig(tmp_path, changes, says):
 
 def test_a_view_that_does_not_exist():
     run = vflatten("replay", BAG, "--views", "3,99", "--method", "kita2019")
-    assert_one_line(run, "cloud 99 gave no view")
+    assert_one_line(run, "cloud 99 is not in the recording; there are views 0, 1, 2")
+
+
+def test_a_view_that_is_asked_for_but_was_dropped_says_why(tmp_path):
+    def edit(topic, index, data):
+        return without_points(data) if (topic, index) == (CLOUDS, 3) else data
+
+    run = vflatten("replay", copy(tmp_path / "bag", edit), "--views", "3,9")
+    assert_one_line(run, "cloud 3 gave no view, empty_after_segmentation: ")
 
 
 def test_one_view_is_too_few_for_the_automatic_method():

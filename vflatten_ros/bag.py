@@ -11,13 +11,14 @@ from typing import Any
 from mcap.records import Channel, Message, Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from vflatten_ros.core.buffer import Event, ViewAdded, ViewBuffer, ViewReplaced
+from vflatten_ros.core.buffer import CloudDropped, Event, ViewAdded, ViewBuffer, ViewReplaced
 from vflatten_ros.core.config import Config
 from vflatten_ros.core.errors import InvalidCloud, InvalidRecording
 from vflatten_ros.core.pointcloud import PointField, decode_cloud
 from vflatten_ros.core.values import Calibration, Cloud, Progress, View, no_progress
 from vflatten_ros.mcap_files import (
     BROKEN,
+    ZSTD,
     Topic,
     first_log_ns,
     one_line,
@@ -105,6 +106,11 @@ class Recording:
                 )
                 break
             count += 1
+            if message.data[:4] == ZSTD:
+                raise InvalidRecording(
+                    f"{path}: messages are compressed one by one; write the bag anew, "
+                    "uncompressed, with 'ros2 bag convert'"
+                )
             if channel.id not in decoders:
                 decoders[channel.id] = _decoder(factory, schema, channel, path)
             try:
@@ -160,6 +166,7 @@ def gather_views(
     config: Config,
     progress: Progress = no_progress,
     on_view: Callable[[View], None] = lambda view: None,
+    on_drop: Callable[[CloudDropped], None] = lambda event: None,
 ) -> ViewBuffer:
     """Run a whole recording through a view buffer.
 
@@ -171,6 +178,8 @@ def gather_views(
     progress : Progress
     on_view : callable
         Told every view as it comes, those included that give way to better ones later.
+    on_drop : callable
+        Told every cloud that gives none, and every view that gives way, with the reason.
 
     Raises
     ------
@@ -180,11 +189,11 @@ def gather_views(
     buffer = ViewBuffer(calibration, config)
     clouds = 0
     for message in recording.messages():
-        _tell(buffer, _take(buffer, message), on_view)
+        _tell(buffer, _take(buffer, message), on_view, on_drop)
         if isinstance(message, RecordedCloud):
             clouds += 1
             progress("views", min(clouds / recording.clouds, 1.0) if recording.clouds else 0.0)
-    _tell(buffer, buffer.finish(), on_view)
+    _tell(buffer, buffer.finish(), on_view, on_drop)
     _check_views(recording, calibration, buffer)
     progress("views", 1.0)
     return buffer
@@ -200,7 +209,15 @@ def _take(buffer: ViewBuffer, message: RecordedCloud | RecordedJoints) -> tuple[
         return buffer.reject_cloud(str(error), at)
 
 
-def _tell(buffer: ViewBuffer, events: Sequence[Event], on_view: Callable[[View], None]) -> None:
+def _tell(
+    buffer: ViewBuffer,
+    events: Sequence[Event],
+    on_view: Callable[[View], None],
+    on_drop: Callable[[CloudDropped], None],
+) -> None:
+    for event in events:
+        if isinstance(event, CloudDropped):
+            on_drop(event)
     new = {e.view_id for e in events if isinstance(e, ViewAdded | ViewReplaced)}
     for view in buffer.views() if new else ():
         if view.view_id in new:

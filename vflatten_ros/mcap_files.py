@@ -19,6 +19,9 @@ from vflatten_ros.core.errors import InvalidRecording
 BROKEN = Exception
 
 
+ZSTD = b"\x28\xb5\x2f\xfd"  # what zstd has compressed begins so
+
+
 @dataclass(frozen=True)
 class Topic:
     """One topic of a recording."""
@@ -69,7 +72,7 @@ def _mcap(path: Path) -> Path:
     kind, remedy = "not an mcap file", "record with 'ros2 bag record --storage mcap'"
     if start[:6] == b"SQLite":
         kind, remedy = "an SQLite bag", "convert it with 'ros2 bag convert' to storage mcap"
-    elif start[:4] == b"\x28\xb5\x2f\xfd":
+    elif start[:4] == ZSTD:
         kind, remedy = "compressed as a whole", "unpack it with 'zstd -d'"
     elif not start:
         kind = "empty"

@@ -192,19 +192,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         recording = open_recording(args.recording, args.cloud_topic, args.joint_topic)
     except VFlattenError as error:
-        print(f"vflatten play: {error}", file=sys.stderr)
-        return 1
+        return _fail(str(error))
     transport.use_profile()
     # rclpy's handlers shut the context down from another thread, perhaps while it is published
     try:
         rclpy.init(args=given[at:], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # of rcl, which parses the arguments
-        print(f"vflatten play: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
+        return _fail(" ".join(str(error).split()))
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as SIGINT
     node = Node("vflatten_player")
     try:
         return _play(node, recording, args)
+    except VFlattenError as error:
+        return _fail(str(error))
     except KeyboardInterrupt:
         return 130
     finally:
@@ -212,6 +212,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             signal.signal(number, signal.SIG_IGN)  # it ends already
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _fail(text: str) -> int:
+    print(f"vflatten play: {text}", file=sys.stderr)
+    return 1
 
 
 def _play(node: Node, recording: Recording, args: argparse.Namespace) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
-from vflatten_ros.bag import Recording, gather_views, open_recording
+from vflatten_ros.bag import gather_views, open_recording
 from vflatten_ros.categories import load_templates
 from vflatten_ros.cloud_files import cloud_to_view, load_cloud_file
 from vflatten_ros.core.config import Config
@@ -21,6 +21,7 @@ from vflatten_ros.core.errors import (
     InvalidRecording,
     NotEnoughViews,
 )
+from vflatten_ros.core.events import CloudDropped
 from vflatten_ros.core.hypotheses import Helper
 from vflatten_ros.core.parallel import THREADS
 from vflatten_ros.core.pipeline import flatten_garment, prepare_view
@@ -95,11 +96,19 @@ def replay_recording(
     recording = open_recording(path, cloud_topic, joint_topic)
     with _Preparation(config, wanted) as preparation:
         gathering = _keeping_all(config) if wanted else config
-        buffer = gather_views(recording, rig, gathering, progress, preparation.begin)
+        dropped: dict[int, CloudDropped] = {}
+        buffer = gather_views(
+            recording,
+            rig,
+            gathering,
+            progress,
+            preparation.begin,
+            lambda event: dropped.update({event.view_id: event}),
+        )
         for text in recording.warnings:
             warn(text)
         state = buffer.state()
-        views = _select(buffer.views(), wanted, recording)
+        views = _select(buffer.views(), wanted, dropped, path)
         if config.method == "rotation" and len(views) < 2:
             raise NotEnoughViews(
                 f"{path}: method rotation needs two views or more, got {len(views)}; use more of "
@@ -194,14 +203,17 @@ def _keeping_all(config: Config) -> Config:
     return dataclasses.replace(config, buffer=buffer)
 
 
-def _select(views: Sequence[View], wanted: Sequence[int], recording: Recording) -> tuple[View, ...]:
+def _select(
+    views: Sequence[View], wanted: Sequence[int], dropped: Mapping[int, CloudDropped], path: Path
+) -> tuple[View, ...]:
     by_id = {view.view_id: view for view in views}
-    missing = [i for i in wanted if i not in by_id]
-    if missing:
-        known = ", ".join(str(i) for i in by_id)
-        raise NotEnoughViews(
-            f"{recording.path}: cloud {missing[0]} gave no view; there are views {known}"
-        )
+    for i in wanted:
+        if i not in by_id:
+            known = ", ".join(str(i) for i in by_id)
+            why = "is not in the recording"
+            if i in dropped:
+                why = f"gave no view, {dropped[i].reason}: {dropped[i].text}"
+            raise NotEnoughViews(f"{path}: cloud {i} {why}; there are views {known}")
     return tuple(by_id[i] for i in wanted) if wanted else tuple(views)
 
 

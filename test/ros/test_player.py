@@ -7,12 +7,14 @@ from types import SimpleNamespace
 
 import pytest
 import rclpy
+import zstandard
 from rclpy.qos import qos_profile_sensor_data
+from recordings import Message, joints, write_bag
 from ros_rig import RECORDING, Process, recorded, unused_namespace
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, PointCloud2
 
-from vflatten_ros.bag import RecordedCloud, open_recording
+from vflatten_ros.bag import CLOUD_TYPE, RecordedCloud, open_recording
 from vflatten_ros.player import Player
 
 
@@ -120,6 +122,16 @@ def test_a_rate_that_is_no_number_is_wrong_usage(tmp_path):
     player = Process(["-m", "vflatten_ros.player", "x", "--rate", "x"], tmp_path / "log")
     assert player.wait() == 2
     assert "--rate: expected a number above 0, got x" in player.log()
+
+
+def test_a_recording_whose_messages_cannot_be_read_ends_with_one_line(tmp_path):
+    message = Message(1, "/points", CLOUD_TYPE, zstandard.ZstdCompressor().compress(bytes(99)))
+    bag = write_bag(tmp_path / "bag", [[message, joints(2, 0.0)]])
+    command = ["-m", "vflatten_ros.player", str(bag), "--quiet", "--wait", "0"]
+    player = Process(command, tmp_path / "log")
+    assert player.wait() == 1
+    (line,) = player.log().splitlines()
+    assert line.startswith("vflatten play: ") and "compressed one by one" in line
 
 
 def test_a_recording_that_is_not_there_ends_with_one_line(tmp_path):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import time
@@ -14,7 +15,7 @@ import garments
 from vflatten_ros.worker import STOP
 
 ENOUGH = 10  # views
-GOOD, SLOW, STUBBORN, CRASH, WRONG, MISTAKE, SILENT, ENDLESS = range(30, 38)
+GOOD, SLOW, STUBBORN, CRASH, WRONG, MISTAKE, SILENT, ENDLESS, UNTRUSTED = range(30, 39)
 STEP_S = 0.02
 HOURS_S = 1e4  # longer than any test waits
 
@@ -45,6 +46,7 @@ class SlowWork:
 
 def example_or_trouble(what, progress):
     from vflatten_ros.core.errors import NotEnoughViews
+    from vflatten_ros.core.values import Notice
 
     if what == STUBBORN:  # before it says that it works, or a quick cancel is heard
         signal.pthread_sigmask(signal.SIG_BLOCK, {STOP})  # as a long computation in C
@@ -61,4 +63,8 @@ def example_or_trouble(what, progress):
     for step in range(steps):
         progress("work", step / steps)
         time.sleep(STEP_S)
-    return garments.example_garment()
+    garment = garments.example_garment()
+    if what == UNTRUSTED:
+        notices = (*garment.notices, Notice("untrusted", "nobody knows"))
+        garment = dataclasses.replace(garment, notices=notices)
+    return garment

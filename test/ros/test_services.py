@@ -176,6 +176,17 @@ def test_a_landmark_is_located_by_the_newest_joint_state_and_stamped_as_that(tur
     turned.set_parameter("no_data_warning_s", 5.0)
 
 
+@pytest.mark.parametrize(
+    ("nodes", "trusted"), [(slow_work.GOOD, True), (slow_work.UNTRUSTED, False)]
+)
+def test_a_landmark_is_trusted_as_the_result_is(turned, nodes, trusted):
+    assert turned.set_parameter("geodesics.nodes", nodes).successful
+    result = turned.flatten().result
+    given = turned.ask("locate_landmark", name=MARK, at_angle=True, item_angle=0.0)
+    assert given.status.code == Status.OK
+    assert (result.estimate.trusted, given.trusted) == (trusted, trusted)
+
+
 def test_a_landmark_is_not_located_by_a_joint_state_that_came_long_ago(turned):
     assert turned.flatten().result.status.code == Status.OK
     turned.set_parameter("no_data_warning_s", 0.5)

@@ -212,6 +212,23 @@ def test_a_flood_of_mistakes_does_not_flood_the_log(rig):
     rig.serves_a_good_rotation()
 
 
+def test_a_clock_that_goes_to_and_fro_does_not_flood_the_log(rig):
+    """As where two publishers stamp by different clocks; an item with its views came before."""
+    reactivate(rig)
+    arm = Turning(rig)
+    arm.turn(8.0, rate=0.5)
+    for at_s in range(2, 8):
+        arm.see(float(at_s))
+    before = len(rig.node.log())
+    item = rig.buffer().item
+    for _ in range(5):
+        for arm.now_s in (100.0, 1.0):
+            arm.turn(0.1)
+    rig.until(lambda: rig.buffer().item == item + 5, "an item for each time it was set back")
+    assert 1 <= rig.node.log()[before:].count("begins: the clock was set back") <= 2
+    reactivate(rig)
+
+
 def test_two_rigs_side_by_side_each_hear_their_own(ros, tmp_path):
     """One of them by bag time, which is another's past."""
     recordings = [CALIBRATION.parents[1] / name for name in ("LS1_1", "TR1_1")]

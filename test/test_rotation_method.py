@@ -124,6 +124,20 @@ def test_layers_that_lie_flush_spoil_the_skirt_unless_they_are_looked_for(most_w
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("name", "by_cloth"), [("LS1_1", True), ("TR1_1", False)])
+def test_sleeves_lie_as_their_cloth_has_them_and_legs_as_legs_do(monkeypatch, name, by_cloth):
+    asked = []
+
+    def turn_parts(unfolded, swung, rest, config, relax):
+        asked.append(relax)
+        return rotation.turn_parts(unfolded, swung, rest, config, relax)
+
+    monkeypatch.setattr(pipeline, "turn_parts", turn_parts)
+    replay_recording(BAGS / name, ONE_WAY)
+    assert set(asked) == {by_cloth}
+
+
+@pytest.mark.slow
 def test_a_leg_that_hangs_by_hidden_cloth_is_put_in_its_place(monkeypatch):
     """The trousers as if what joins their legs were in doubt."""
     monkeypatch.setattr(ways, "WAYS", ((0, 1.0),))

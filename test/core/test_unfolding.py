@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.unfolding import carry, creased, orientation, place_samples, settle, unfold
+from vflatten_ros.core.unfolding import (
+    carry,
+    creased,
+    orientation,
+    place_samples,
+    relaxed,
+    settle,
+    unfold,
+)
 
 CONFIG = RotationConfig(unfold_rounds=8)
 
@@ -54,6 +62,53 @@ def test_a_round_tube_creases_sharply():
     assert extent[0] == pytest.approx(girth / 2, rel=0.02)
     assert extent[1] == pytest.approx(np.ptp(at[:, 1]), rel=0.02)
     assert 0.1 < creased(plane, bound, near) < 0.3
+
+
+def sleeve(seed=3):
+    """A sleeve on a body, and the same bent upwards along its length, by 0.3 rad at its end."""
+    rng = np.random.default_rng(seed)
+    body = rng.uniform([-0.3, -0.4], [0.0, 0.0], (120, 2))
+    arm = rng.uniform([0.0, -0.09], [0.35, 0.0], (80, 2))
+    true = np.vstack([body, arm])
+    bent = true.copy()
+    angle = np.maximum(true[:, 0], 0.0) / 0.35 * 0.3
+    bent[:, 1] += np.maximum(true[:, 0], 0.0) * angle / 2
+    bent += true[:, 1:] * np.column_stack([-np.sin(angle), np.cos(angle) - 1.0])
+    bound = np.linalg.norm(true[:, None] - true[None], axis=2)
+    bound *= 1.0 + np.triu(rng.normal(0, 0.003, bound.shape), 1)
+    return true, bent, np.triu(bound) + np.triu(bound).T
+
+
+def test_a_bent_sleeve_is_straight_once_relaxed():
+    true, bent, bound = sleeve()
+    near = bound < 0.1
+    off = {
+        name: np.linalg.norm(aligned(plane, true) - true, axis=1).max()
+        for name, plane in (
+            ("bent", bent),
+            ("settled", settle(bent, bound, near, CONFIG)),
+            ("relaxed", relaxed(bent, bound, near)),
+        )
+    }
+    assert off["bent"] > 0.03
+    assert off["settled"] > 0.01  # as majorisation leaves it
+    assert off["relaxed"] < 0.003
+
+
+def test_what_lies_right_stays_where_it_is_when_relaxed():
+    true = np.add(plane_of(120, 0.3, 0.5), [3.0, -2.0])
+    bound = np.linalg.norm(true[:, None] - true[None], axis=2)
+    assert np.abs(relaxed(true, bound, bound < 0.15) - true).max() < 1e-9
+
+
+def test_what_is_relaxed_neither_spreads_nor_closes_up():
+    """Two sheets with upper bounds between them only."""
+    true = plane_of(160, 0.2, 0.3, seed=5) + np.repeat([[0.0, 0.0], [0.25, 0.0]], 80, axis=0)
+    bound = np.linalg.norm(true[:, None] - true[None], axis=2)
+    sheet = np.repeat([0, 1], 80)
+    same = sheet[:, None] == sheet
+    found = relaxed(true, np.where(same, bound, bound + 0.05), same & (bound < 0.1))
+    assert np.abs(found - true).max() < 1e-6
 
 
 def test_a_sheet_has_no_creases_and_one_folded_over_has():

@@ -49,6 +49,9 @@ from vflatten_ros.core.values import (
 
 MOST_JUDGED = 3  # corresponding points given, up to which others are found to judge them
 TURNS = 2  # of loose parts: the fit of the template is better once they lie nearly right
+# Spread of a part's usual angle beyond which its cloth tells more: sleeves are cut at any angle,
+# and hang on the body along all of their width, if it is one piece; what legs hang on is narrow
+CLOTH_TELLS_RAD = np.radians(6.0)
 AT_REST_M = 0.002  # by which an outline's vertices may be off with its parts at rest
 
 
@@ -179,9 +182,10 @@ def _rotation(
         rest = place(fit.template, fit.pose, fit.template.at_rest(fit.state))[0]
         k = fit.template.vertices
         swung = fit.points()[:k]
+        by_cloth = len(unfolded.parts) == 1 and bool((fit.template.spread > CLOTH_TELLS_RAD).any())
         if turn and np.abs(swung - rest[:k]).max() < AT_REST_M:
             break
-        unfolded = turn_parts(unfolded, swung, rest[:k], config.rotation)
+        unfolded = turn_parts(unfolded, swung, rest[:k], config.rotation, by_cloth)
         progress("parts", (turn + 0.6) / turns)
         found = recognise_again(
             found, unfolded.outline, unfolded.points, tuple(templates), config.recognition

@@ -30,6 +30,7 @@ from vflatten_ros.core.unfolding import (
     orientation,
     overlap,
     place_samples,
+    relaxed,
     settle,
     unfold,
 )
@@ -215,18 +216,24 @@ def laid_flat(
     return places
 
 
-def turn_parts(unfolded: Unfolded, swung: Float, rest: Float, config: RotationConfig) -> Unfolded:
+def turn_parts(
+    unfolded: Unfolded, swung: Float, rest: Float, config: RotationConfig, relax: bool = False
+) -> Unfolded:
     """The same surface with its loose parts (legs, sleeves) turned as a template says.
 
     Parameters
     ----------
     swung, rest : ndarray of shape (k, 2)
         The template's outline as it fits the item, and with its parts at rest.
+    relax : bool
+        Let the parts go from there to where the cloth's own distances have them.
     """
     parts = []
     for part in unfolded.parts:
         plane = carry(part.plane, swung, rest)
         plane = settle(plane, part.distances.bound_m, part.distances.same_sheet, config)
+        if relax:
+            plane = relaxed(plane, part.distances.bound_m, part.distances.same_sheet)
         parts.append(_laid_from(unfolded.surface, Part(part.distances, plane), config))
     if len(parts) == 1:
         return _outlined(parts[0], config)

@@ -27,6 +27,10 @@ SPREAD = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # weight of distances that f
 # non-convexity, Blake and Zisserman 1987)
 CREASING = (0.2, 0.1, 0.05)
 SOFTLY = CREASING[:1]  # for pieces whose edges are the creases
+RELAXING = 16  # steps of Levenberg and Marquardt at most
+RELAXED = 3e-4  # share of the stress: a step that gains less is the last
+FARTHEST_STEP_M = 0.02
+DAMPING, LEAST_DAMPING = 1e-3, 1e-5  # of the first step, and ever; in the median stiffness
 CREASED = 0.2  # share of its distance by which a near pair falls short across a crease
 
 
@@ -96,6 +100,79 @@ def settle(
             plane = towards.step(plane, spread, slack)
     settled: Float = plane + centre
     return settled
+
+
+def relaxed(plane: Float, bound: Float, near: Bool) -> Float:
+    """The plane in which bounds and near distances are kept best, from one that is not far from it.
+
+    Long parts bend so easily that stress majorisation takes thousands of steps to straighten them.
+    These are steps of Levenberg and Marquardt on the same stress, of points that do not spread.
+
+    Parameters
+    ----------
+    plane : ndarray of shape (k, 2)
+        Where they are, m.
+    bound, near : ndarray of shape (k, k)
+        As of unfold.
+
+    Returns
+    -------
+    ndarray of shape (k, 2)
+    """
+    k, centre = len(plane), plane.mean(0)
+    stress = _Stress(bound, near)
+    cost, system, force = stress.at(plane)
+    damping = DAMPING
+    for _ in range(RELAXING):
+        held = system.copy()
+        diagonal = held.ravel()[:: 2 * k + 1]
+        diagonal += damping * np.median(diagonal)  # nothing fixes where the whole lies
+        factor = cho_factor(held.T, overwrite_a=True, check_finite=False)
+        step = cho_solve(factor, force, check_finite=False).reshape(2, k).T
+        step *= min(1.0, FARTHEST_STEP_M / max(float(np.abs(step).max()), 1e-12))
+        tried = stress.at(plane - step)
+        if tried[0] >= cost:
+            damping *= 10.0
+            continue
+        gained = cost - tried[0]
+        plane, damping = plane - step, max(damping / 3.0, LEAST_DAMPING)
+        cost, system, force = tried
+        if gained < RELAXED * cost:
+            break
+    settled: Float = plane - plane.mean(0) + centre
+    return settled
+
+
+class _Stress:
+    """What settle makes small without spreading: a robust stress, one-sided for most pairs."""
+
+    def __init__(self, bound: Float, near: Bool) -> None:
+        self._bound, self._near = bound, near
+        safe = np.where(bound > 0, bound, 1.0)
+        self._base = (bound > 0) / safe**1.5
+        self._gives = CREASING[-1] * safe  # how far a near pair falls short that gives way
+
+    def at(self, plane: Float) -> tuple[float, Float, Float]:
+        """The stress, its (2k, 2k) curvature as of Gauss-Newton, and its (2k,) slope."""
+        k = len(plane)
+        x, y = plane.T
+        flat = np.maximum(_pairwise(plane), 1e-6)
+        u, v = (x[:, None] - x) / flat, (y[:, None] - y) / flat
+        off = flat - self._bound
+        over = off > 0
+        share = (off / self._gives) ** 2
+        gone = np.where(over, off**2, np.where(self._near, self._gives**2 * np.log1p(share), 0.0))
+        cost = float((self._base * gone).sum())
+        weight = self._base * np.where(over, 1.0, np.where(self._near, 1.0 / (1.0 + share), 0.0))
+        pull = weight * off
+        slope = np.r_[(pull * u).sum(1), (pull * v).sum(1)]
+        system = np.empty((2 * k, 2 * k))
+        for first, one in ((0, u), (k, v)):
+            for second, other in ((0, u), (k, v)):
+                block = -weight * one * other
+                block.ravel()[:: k + 1] -= block.sum(1)
+                system[first : first + k, second : second + k] = block
+        return cost, system, slope
 
 
 def creased(plane: Float, bound: Float, near: Bool) -> float:

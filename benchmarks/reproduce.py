@@ -86,6 +86,9 @@ The figures above stand side by side; they are not the same experiment.
   creases that the cloth remembers, fingers that press into it, the mistakes of matching real
   images, lens distortion, shadows, swinging while the wrist turns. Real items will do worse in ways
   that only real recordings can show.
+- **Rounding decides** LS2's length from two views, which rests on an edge that none shows: 36.9,
+  44.3 and 45.0 cm with OpenBLAS's kernels for Sandybridge, Haswell and Nehalem, each within its
+  stated deviation. The same machine gives the same bits every time.
 - **The two views and the points** were chosen by a program that knows the truth: the two views that
   together show most of one side, and five points seen in both, exact to 2.5 mm. A person would not
   be so exact. The two views still show only 82 to 91 % of that side.

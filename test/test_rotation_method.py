@@ -126,15 +126,20 @@ def test_layers_that_lie_flush_spoil_the_skirt_unless_they_are_looked_for(most_w
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "by_cloth"), [("LS1_1", True), ("TR1_1", False)])
 def test_sleeves_lie_as_their_cloth_has_them_and_legs_as_legs_do(monkeypatch, name, by_cloth):
-    asked = []
+    asked, moved_m = [], []
 
     def turn_parts(unfolded, swung, rest, config, relax):
         asked.append(relax)
-        return rotation.turn_parts(unfolded, swung, rest, config, relax)
+        turned = rotation.turn_parts(unfolded, swung, rest, config, relax)
+        held = rotation.turn_parts(unfolded, swung, rest, config)
+        planes = zip(turned.parts, held.parts, strict=True)
+        moved_m.extend(np.abs(a.plane - b.plane).max() for a, b in planes)
+        return turned
 
     monkeypatch.setattr(pipeline, "turn_parts", turn_parts)
     replay_recording(BAGS / name, ONE_WAY)
     assert set(asked) == {by_cloth}
+    assert all((m > 0.002) == by_cloth for m in moved_m)
 
 
 @pytest.mark.slow

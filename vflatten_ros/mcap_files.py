@@ -17,8 +17,6 @@ from vflatten_ros.core.errors import InvalidRecording
 # A file that ends early or is damaged makes the mcap reader and the decompressors, which differ
 # between installations, raise errors with no nearer base in common.
 BROKEN = Exception
-
-
 ZSTD = b"\x28\xb5\x2f\xfd"  # what zstd has compressed begins so
 
 

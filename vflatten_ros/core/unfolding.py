@@ -148,12 +148,14 @@ class _Stress:
 
     def __init__(self, bound: Float, near: Bool) -> None:
         self._bound, self._near = bound, near
-        safe = np.where(bound > 0, bound, 1.0)
-        self._base = (bound > 0) / safe**1.5
+        safe, self._base = _weights(bound)
         self._gives = CREASING[-1] * safe  # how far a near pair falls short that gives way
 
     def at(self, plane: Float) -> tuple[float, Float, Float]:
-        """The stress, its (2k, 2k) curvature as of Gauss-Newton, and its (2k,) slope."""
+        """Of a (k, 2) plane: the stress, its (2k, 2k) curvature as of Gauss-Newton, its slope.
+
+        The slope is of shape (2k,); in both all u come before all v.
+        """
         k = len(plane)
         x, y = plane.T
         flat = np.maximum(_pairwise(plane), 1e-6)
@@ -242,9 +244,8 @@ class _Majorisation:
     """
 
     def __init__(self, bound: Float, near: Bool) -> None:
-        safe = np.where(bound > 0, bound, 1.0)  # 1 where there is no bound
+        safe, self._base = _weights(bound)
         self._bound = bound
-        self._base = (bound > 0) / safe**1.5  # weight of a pair
         self._stay = STAY * self._base  # of its present distance
         self._near = np.flatnonzero(near)
         self._near_bound, self._near_safe = bound.ravel()[self._near], safe.ravel()[self._near]
@@ -302,6 +303,12 @@ class _Majorisation:
 
     def _pairwise(self, plane: Float) -> Float:
         return _pairwise(plane, self._flat, self._weight)
+
+
+def _weights(bound: Float) -> tuple[Float, Float]:
+    """Bounds, with 1 where there is none, and the weights of the pairs; (k, k) each."""
+    safe = np.where(bound > 0, bound, 1.0)
+    return safe, (bound > 0) / safe**1.5
 
 
 def _pairwise(plane: Float, apart: Float | None = None, across: Float | None = None) -> Float:

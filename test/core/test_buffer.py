@@ -423,6 +423,24 @@ def test_a_clock_that_says_so_itself_starts_over_once():
     assert (state.item, state.clock_jumps, len(state.view_ids)) == (2, 1, 1)
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_a_cloud_that_was_on_its_way_when_the_clock_was_set_back_is_of_the_item_before(told):
+    buffer = make()
+    joints(buffer, 0, 20)
+    if told:
+        buffer.clock_set_back(5 * S)
+    else:
+        joints(buffer, 5, 5.1)  # show it themselves
+    (late,) = buffer.add_cloud(cloud(int(20.1 * S)), 0)
+    assert (late.reason, late.view_id) == ("previous_item", -1)
+    assert late.text == "taken before the clock was set back"
+    joints(buffer, 5.1 if not told else 5, 20.5)  # the new time comes to that stamp
+    buffer.add_cloud(cloud(6 * S), 0)
+    buffer.add_cloud(cloud(int(20.1 * S)), 0)
+    state = check_accounts(buffer)
+    assert (state.view_ids, state.drops) == ((0, 1), {"previous_item": 1})
+
+
 def test_joint_states_that_go_on_as_before_are_believed_in_the_end():
     """The clock was set back, but not that of the joint states."""
     buffer = make()

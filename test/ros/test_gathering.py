@@ -268,7 +268,10 @@ def test_bag_time_that_begins_anew_begins_one_item(ros, tmp_path):
         rig.play("--rate", 6, "--loop", 2, "--clock")
         buffer = rig.until(rig.complete, "the rotation")
         assert buffer.item == 2
-        assert not buffer.drop_counts
+        # of the first round, the last cloud may come after the clock has been set back
+        late = dict(zip(buffer.drop_reasons, buffer.drop_counts, strict=True))
+        assert late in ({}, {"previous_item": 1})
+        assert len(buffer.views) == 24
         assert rig.diagnostics()["buffer"]["clock jumps"] == "1"
     finally:
         rig.close()

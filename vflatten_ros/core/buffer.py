@@ -129,9 +129,9 @@ class ViewBuffer:
 
     def add_cloud(self, cloud: Cloud, received_ns: int) -> tuple[Event, ...]:
         """Take one decoded cloud: its item is segmented at once, its angle decided when known."""
-        if self._item_start_ns is not None and cloud.stamp_ns < self._item_start_ns:
+        if late := self._late(cloud.stamp_ns):
             self._received += 1  # takes no id, so that ids do not depend on how late it came
-            text = "taken before the present item was held" + _unstamped(cloud.stamp_ns)
+            text = late + _unstamped(cloud.stamp_ns)
             return (self._drop(-1, "previous_item", text), *self._settle(received_ns))
         view_id = self._count_cloud()
         if cloud.frame_id != self._calibration.frame:
@@ -238,6 +238,7 @@ class ViewBuffer:
         self._newest_ns: int | None = None
         self._first_turns: int | None = None
         self._item_start_ns: int | None = None
+        self._before_jump: tuple[int, int] | None = None  # stamps of clouds on their way then
 
     def _start_item(self, cause: str, start_ns: int | None) -> list[Event]:
         """Begin the next item; clouds taken after its start that came too early move to it."""
@@ -297,9 +298,24 @@ class ViewBuffer:
         self._clock_jumps += 1
         events: list[Event] = [ClockJumped(from_ns, to_ns)]
         self._waiting = early
-        return events + self._start_item(CLOCK_SET_BACK, min(to_ns, from_ns))
+        events += self._start_item(CLOCK_SET_BACK, min(to_ns, from_ns))
+        jump_ns = int(self._config.buffer.clock_jump_s * 1e9)
+        self._before_jump = ((from_ns + to_ns) // 2, from_ns + jump_ns)
+        return events
 
     # ---- clouds
+
+    def _late(self, stamp_ns: int) -> str:
+        """Why a cloud shows an item before the present one, if it does."""
+        if self._item_start_ns is not None and stamp_ns < self._item_start_ns:
+            return "taken before the present item was held"
+        if self._before_jump is None:
+            return ""
+        from_ns, until_ns = self._before_jump
+        ahead_ns = (self._track.newest_ns or 0) + self._config.buffer.clock_jump_s * 1e9
+        if from_ns <= stamp_ns <= until_ns and stamp_ns > ahead_ns:
+            return "taken before the clock was set back"
+        return ""
 
     def _settle(self, now_ns: int, last: bool = False) -> tuple[Event, ...]:
         """Decide every waiting cloud that can be decided, in order of arrival."""

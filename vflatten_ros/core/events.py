@@ -18,7 +18,7 @@ DROP_REASONS: Mapping[str, str] = {
     "duplicate_angle": "a better view was taken at nearly the same angle",
     "invalid_cloud": "the message contradicts itself",
     "gripper_open": "the fingers were open",
-    "previous_item": "the cloud was taken before the present item was held",
+    "previous_item": "the cloud was taken before the present item was held, or the clock set back",
     "cleared": "removed on request",
 }
 

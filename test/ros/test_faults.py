@@ -290,8 +290,9 @@ def test_a_ros_time_that_jumps_back_begins_a_new_item(ros, tmp_path):
         for seconds in (1_700_000_020, 1_699_999_999):  # just before the recording, again
             message = Clock()
             message.clock.sec = seconds
-            clock.publish(message)
-            time.sleep(0.3)
+            for _ in range(5):  # a node takes the clock best effort
+                clock.publish(message)
+                time.sleep(0.1)
         rig.until(lambda: rig.buffer().item == item + 1, "a new item")
         assert "stamps went back" in rig.node.log()
         rig.serves_a_good_rotation()

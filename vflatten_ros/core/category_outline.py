@@ -46,13 +46,14 @@ def with_category(outline: Outline, fit: Fit, misfit_m: float) -> Outline:
     cols, rows = np.ceil((high - low) / CELL_M).astype(int) + 1
     category = _inside_m(points[:k], low, (rows, cols))
     differs = _inside_m(outline.uv, low, (rows, cols)) - category
-    if outline.inferred.any():
-        cells = low + CELL_M * np.argwhere(np.ones((rows, cols)))[:, ::-1]
-        nearest = cKDTree(outline.uv).query(cells)[1].reshape(rows, cols)
-        differs[outline.inferred[nearest] & (differs < 0.0)] = 0.0
     seen_m = float(np.median(outline.sigma_m))
     share = misfit_m**2 / (misfit_m**2 + seen_m**2)
     bounded = np.minimum(np.abs(differs) / (CUT * np.hypot(misfit_m, seen_m)), 1.0)
+    if outline.inferred.any():
+        row, col = np.nonzero((differs < 0.0) & (bounded < 1.0))
+        nearest = cKDTree(outline.uv).query(low + CELL_M * np.column_stack([col, row]))[1]
+        hidden = outline.inferred[nearest]
+        differs[row[hidden], col[hidden]] = 0.0
     inside = category + share * (1.0 - bounded**2) ** 2 * differs > 0.0
     contours, _ = cv2.findContours(
         inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE

@@ -354,9 +354,10 @@ def place_samples(around: Int, around_m: Float, sheet: Bool, plane: Float) -> tu
     misfit_m : ndarray of shape (n,)
         Root of the mean squared excess over the distances, inf where uv is NaN.
     """
-    uv, misfit = np.empty((len(around), 2)), np.empty(len(around))
-    for start in range(0, len(around), BLOCK):
-        some = slice(start, start + BLOCK)
+    uv, misfit = np.full((len(around), 2), np.nan), np.full(len(around), np.inf)
+    rows = np.flatnonzero(np.isfinite(around_m).sum(1) >= 3)
+    for start in range(0, len(rows), BLOCK):
+        some = rows[start : start + BLOCK]
         uv[some], misfit[some] = _placed(around[some].T, around_m[some].T, sheet[some].T, plane)
     return uv, misfit
 
@@ -387,11 +388,8 @@ def _placed(around: Int, around_m: Float, sheet: Bool, plane: Float) -> tuple[Fl
         vv = (weight * dv * dv).sum(0) + damping
         size = uu * vv - cross * cross
         u, v = u - (vv * fu - cross * fv) / size, v - (uu * fv - cross * fu) / size
-    uv = np.column_stack([u, v])
     misfit = np.sqrt((base * excess.clip(0) ** 2).sum(0) / total)
-    few = known.sum(0) < 3
-    uv[few], misfit[few] = np.nan, np.inf
-    return uv, misfit
+    return np.column_stack([u, v]), misfit
 
 
 def orientation(uv: Float, xyz: Float, normal: Float, a: Int, b: Int) -> Float:
@@ -400,7 +398,9 @@ def orientation(uv: Float, xyz: Float, normal: Float, a: Int, b: Int) -> Float:
     From the links (a, b) around a sample: whether their directions turn the same way in the plane
     as about its normal.
     """
-    start, end = np.r_[a, b], np.r_[b, a]
+    placed = np.isfinite(uv).all(1)
+    both = placed[a] & placed[b]
+    start, end = np.r_[a[both], b[both]], np.r_[b[both], a[both]]
     chord, flat = xyz[end] - xyz[start], uv[end] - uv[start]
     mean = np.zeros((len(xyz), 3, 2))  # sum of chord x flat: its minors give the sign of the map
     for i in range(3):

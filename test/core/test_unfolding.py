@@ -160,6 +160,27 @@ def test_a_mirrored_part_lies_with_its_outside_down():
     assert (orientation(flat * [-1, 1], xyz, normal, a, b) == -1).all()
 
 
+def test_a_sample_with_two_landmarks_near_lies_nowhere_and_its_neighbours_lie_on():
+    marks = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
+    at = np.array([[0.04, 0.04], [0.05, 0.05], [0.06, 0.03]])
+    around = np.tile(np.arange(3), (3, 1))
+    near = np.linalg.norm(at[:, None] - marks, axis=2)
+    near[1, 2] = np.inf
+    uv, misfit = place_samples(around, near, np.ones((3, 3), dtype=bool), marks)
+    assert np.isnan(uv[1]).all() and np.isinf(misfit[1])
+    assert uv[[0, 2]] == pytest.approx(at[[0, 2]], abs=1e-4)
+
+
+def test_which_way_up_what_lies_beside_the_unplaced_is_clear():
+    flat = np.stack(np.meshgrid(np.arange(6), np.arange(6)), -1).reshape(-1, 2) * 0.01
+    xyz, normal = np.c_[flat, np.zeros(36)], np.tile([0.0, 0.0, 1.0], (36, 1))
+    a, b = np.nonzero(np.triu(np.linalg.norm(flat[:, None] - flat, axis=2) < 0.015, 1))
+    uv = flat.copy()
+    uv[:12] = np.nan  # the cloth there belongs to another group
+    up = orientation(uv, xyz, normal, a, b)
+    assert (up[12:] == 1).all() and (up[:12] == 0).all()
+
+
 def test_points_follow_the_part_of_the_outline_that_turns():
     """An L whose long arm turns by 40 degrees about the corner."""
     outline = np.array([[0, 0], [0.1, 0], [0.1, -0.5], [0.2, -0.5], [0.2, 0.1], [0, 0.1]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vflatten_ros.core.config import RotationConfig
-from vflatten_ros.core.distances import largest_pieces, surface_distances
+from vflatten_ros.core.distances import largest_pieces, link_steps, surface_distances
 from vflatten_ros.core.errors import DisconnectedSurface
 from vflatten_ros.core.sheets import Links, link_samples
 
@@ -110,6 +110,16 @@ def test_links_among_some_samples_are_those_of_these_samples_alone():
     assert len(among.a) > 500
     length = np.linalg.norm(xyz[some][among.a] - xyz[some][among.b], axis=1)
     assert np.abs(length - among.length_m).max() < 1e-3
+
+
+def test_steps_among_some_samples_are_those_of_these_samples_alone():
+    xyz, normal, _ = rolled(0.05)
+    some = np.random.default_rng(4).random(len(xyz)) < 0.7
+    links = link_samples(xyz, normal, CONFIG)
+    steps = link_steps(xyz, normal, links).among(some)
+    alone = link_steps(xyz[some], normal[some], links.among(some))
+    for one, other in zip(vars(steps).values(), vars(alone).values(), strict=True):
+        assert np.array_equal(one, other)
 
 
 def test_pieces_on_both_sides_of_a_strip_come_largest_first():

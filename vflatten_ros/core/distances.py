@@ -54,6 +54,14 @@ class Steps:
     turn: NDArray[np.complex128]  # (2m,) unit: from the frame of the end to that of the start
     rim: Bool  # (2m,)
 
+    def among(self, some: Bool) -> Steps:
+        """Those between some of the samples, which are numbered anew."""
+        start, end = np.divmod(self.key, len(some))
+        kept = np.flatnonzero(some[start] & some[end])
+        number = np.cumsum(some) - 1
+        key = number[start[kept]] * int(some.sum()) + number[end[kept]]
+        return Steps(key, self.step[kept], self.turn[kept], self.rim[kept])
+
 
 @dataclass(frozen=True, eq=False)
 class _Walk:
@@ -221,7 +229,8 @@ def surface_distances(
     around_m = np.full(around.shape, np.inf)
     around_sheet = np.zeros(around.shape, dtype=bool)
     around_m[reached], around_sheet[reached] = walk.lengths(ends.part(slice(2 * met, None)))
-    bound = shortest_path(np.where(np.isfinite(local), local, 0.0), method="D", directed=False)
+    # symmetric: "directed" is the same, and does not look at each pair twice
+    bound = shortest_path(np.where(np.isfinite(local), local, 0.0), method="D", directed=True)
     if not np.isfinite(bound).all():
         raise DisconnectedSurface(
             "landmarks farther apart than rotation.local_m; raise it or rotation.landmarks"

@@ -208,7 +208,8 @@ def laid_flat(
     xyz, normal = surface.samples.xyz[rows], surface.samples.normal[rows]
     alone = links.among(piece)
     everywhere = np.ones(len(rows), dtype=bool)
-    distances = surface_distances(xyz, normal, alone, everywhere, rough, progress)
+    steps = surface.steps.among(piece)
+    distances = surface_distances(xyz, normal, alone, everywhere, rough, progress, steps)
     plane = unfold(distances.bound_m, distances.same_sheet, rough, progress, SOFTLY)
     uv = place_samples(distances.around, distances.around_m, distances.around_sheet, plane)[0]
     places = np.full((len(piece), 2), np.nan)

@@ -38,6 +38,7 @@ import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.stats import spearmanr
 
 from vflatten_ros.bag import open_recording
 from vflatten_ros.core.config import Config
@@ -61,6 +62,8 @@ RUNS = {
 }
 DRAWN = 20  # none of the draws that the method takes, or that it was built with
 USUAL_M = 1.4  # from the rig to the wrist's axis, at most
+SURE = (("0.99 and more", 0.99, 2.0), ("0.9 to 0.99", 0.9, 0.99), ("less", 0.0, 0.9))
+FEWEST_RANKED = 8  # results, for their ranks to be compared
 FAILED_SIZE_PCT = 7.0  # a size further off than this is drawn
 
 HEAD = """# Accuracy
@@ -93,6 +96,8 @@ class Row:
     landmark_median_m: float | None
     seconds: float
     notes: tuple[str, ...]
+    probability: float | None = None  # of its category, where scores are probabilities
+    quality: float | None = None
 
     @property
     def right(self) -> bool:
@@ -246,7 +251,16 @@ def judged(
         landmark_median_m=landmark_error(truth, result),
         seconds=seconds,
         notes=notes,
+        probability=probability(result),
+        quality=result.get("quality"),
     )
+
+
+def probability(result: Mapping[str, Any]) -> float | None:
+    """Of the category that a result names; None where its scores are no probabilities."""
+    if result.get("score_kind") != "probability":
+        return None
+    return float(result["scores"][result["category"]])
 
 
 def recorded(truth: Mapping[str, Any]) -> str:
@@ -326,7 +340,7 @@ def landmark_error(truth: Mapping[str, Any], result: Mapping[str, Any]) -> float
 
 def section(title: str, tables: Mapping[str, Sequence[Row]], pictures: str) -> list[str]:
     """One run: its figures of merit, the table of each group, and what failed."""
-    lines = [f"## {title}", "", *figures_of_merit(tables), ""]
+    lines = [f"## {title}", "", *figures_of_merit(tables), "", *how_sure(tables)]
     for name, rows in tables.items():
         lines += [f"### {name[0].upper()}{name[1:]}", "", *table(rows), ""]
         for row in (row for row in rows if row.failed):
@@ -421,6 +435,48 @@ def figures_of_merit(tables: Mapping[str, Sequence[Row]]) -> list[str]:
         "Means over the recordings; landmarks in brackets: without items whose ends are alike, of "
         "which nothing but the hold tells which is called top.",
     ]
+
+
+def how_sure(tables: Mapping[str, Sequence[Row]]) -> list[str]:
+    """Whether categories are right as often as they are said to be, and what the quality tells."""
+    everything = [row for rows in tables.values() for row in rows]
+    told = [row for row in everything if row.probability is not None]
+    lines: list[str] = []
+    if told:
+        lines += ["| probability of the category | results | its mean | right |"]
+        lines += ["| --- | --- | --- | --- |"]
+        for name, low, high in SURE:
+            rows = [row for row in told if low <= (row.probability or 0.0) < high]
+            if rows:
+                mean = float(np.mean([row.probability for row in rows]))
+                right = float(np.mean([row.right for row in rows]))
+                lines.append(f"| {name} | {len(rows)} | {mean:.3f} | {right:.3f} |")
+        lines.append("")
+    errors = {
+        "median error of the points": [row.point_median_m for row in everything],
+        "overlap": [None if row.overlap is None else -row.overlap for row in everything],
+        "larger error of W and L": [
+            max((abs(e) for e in row.error_pct.values() if e is not None), default=None)
+            for row in everything
+        ],
+    }
+    found = []
+    for name, values in errors.items():
+        pairs = [
+            (row.quality, value)
+            for row, value in zip(everything, values, strict=True)
+            if row.quality is not None and value is not None
+        ]
+        if len(pairs) >= FEWEST_RANKED:
+            found.append(f"{spearmanr(*zip(*pairs, strict=True)).statistic:+.2f} ({name})")
+    if found:
+        lines += [
+            "Rank correlation (Spearman) of the quality with how wrong a result is: "
+            + ", ".join(found)
+            + ". -1: the better the quality, the better the result; 0: it tells nothing.",
+            "",
+        ]
+    return lines
 
 
 def _share(sigmas: Sequence[float], limit: float) -> str:

@@ -55,7 +55,7 @@ class Steps:
     rim: Bool  # (2m,)
 
     def among(self, some: Bool) -> Steps:
-        """Those between some of the samples, which are numbered anew."""
+        """Steps between some of the (n,) samples, numbered as these alone are."""
         start, end = np.divmod(self.key, len(some))
         kept = np.flatnonzero(some[start] & some[end])
         number = np.cumsum(some) - 1
